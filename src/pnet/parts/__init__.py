@@ -1,0 +1,1 @@
+"""Parametric parts: keypoint rules, solids, symmetry; one file a template."""

@@ -1,0 +1,157 @@
+"""What every parametric part declares, and what follows from it."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pnet.geometry.pose_space import PoseSpace
+from pnet.geometry.symmetry import FiniteSymmetry, Symmetry
+from pnet.parts.keypoints import Keypoint, KeypointChain
+
+Points = NDArray[np.float64]
+
+
+class ParametricPart(ABC):
+    """A shape template; a part object is the template with parameter values.
+
+    The part frame has its origin at the volume centroid, metres. A subclass declares the class
+    attributes and the two solids; grids come from its config.
+
+    Attributes:
+        name: the template's name. parameter_names: (k) in the order of every parameter array.
+        keypoints: the declaration from which labels, parameters and the fit follow.
+        symmetry: proper rotations that leave the part unchanged.
+        mirror: (3, 3) an improper symmetry that turns the label keypoints into the other chirality, or None.
+    """
+
+    name: str
+    parameter_names: tuple[str, ...]
+    keypoints: tuple[Keypoint, ...]
+    symmetry: Symmetry
+    mirror: Tensor | None = None
+
+    def __init__(
+        self,
+        learning: Mapping[str, Sequence[float]],
+        generalization: Mapping[str, Sequence[float]],
+        sections: int = 48,
+    ) -> None:
+        """
+        Args:
+            learning: parameter → values in mm; all combinations are the part objects of the training
+                set and of the L-dataset. generalization: the same for the G-dataset.
+            sections: polygon sides that stand for a circle in the mesh.
+        """
+        if sections < 6 or sections % 6:
+            raise ValueError(f"{self.name}: sections is {sections}, expected a multiple of 6")
+        self.sections = sections
+        self.chain = KeypointChain(self.keypoints, self.parameter_names)
+        self.grids = {"L": self._grid("learning", learning)}
+        self.grids["G"] = self._grid("generalization", generalization)
+
+    @abstractmethod
+    def check(self, parameters: Points) -> None:
+        """Raise ValueError where values make no valid solid. parameters: (k,) metres."""
+
+    @abstractmethod
+    def mesh(self, parameters: Points) -> trimesh.Trimesh:
+        """The watertight solid, faces wound outwards, in the part frame. parameters: (k,) metres."""
+
+    @abstractmethod
+    def convex_pieces(self, parameters: Points, fill_holes: bool) -> list[Points]:
+        """Corner points of convex pieces for collision, in the part frame.
+
+        Args:
+            parameters: (k,) metres.
+            fill_holes: leave holes out; fewer pieces, for holes too small for another part to enter.
+        Returns:
+            Arrays (n_i, 3), metres; the union of their hulls is the solid (with or without its holes).
+        """
+
+    def part_object(self, grid: str, index: int) -> Points:
+        """Parameters of a part object.
+
+        Args:
+            grid: "L" or "G". index: position in the grid, the first parameter fastest.
+        Returns:
+            (k,) metres.
+        """
+        if grid not in self.grids:
+            raise ValueError(f"{self.name} has no grid {grid!r}: choose L or G")
+        values = self.grids[grid]
+        if not 0 <= index < len(values):
+            raise ValueError(
+                f"{self.name} has no part object {index} in grid {grid}: choose 0 to {len(values) - 1}"
+            )
+        return values[index]
+
+    def pose_space(self, parameters: Points) -> PoseSpace:
+        """The benchmark's pose distance of a part object, by the rule that generated the data set's files.
+
+        Centre: area-weighted surface centroid; Λ: square root of the area-weighted covariance of the
+        surface; threshold: 0.1 of the diameter of the sphere about the centre that holds the mesh.
+        """
+        return pose_space_of_mesh(self.mesh(parameters), self.symmetry)
+
+    @cached_property
+    def k(self) -> int:
+        """Number of parameters."""
+        return len(self.parameter_names)
+
+    def check_named(self, parameters: Points) -> None:
+        """`check`, and what holds for every part: k finite positive values."""
+        if parameters.shape != (self.k,):
+            raise ValueError(f"{self.name} takes parameters {self.parameter_names}, got {parameters}")
+        if not (np.isfinite(parameters).all() and (parameters > 0).all()):
+            raise ValueError(f"{self.name}: parameters must be positive, got {self.text(parameters)}")
+        self.check(parameters)
+
+    def text(self, parameters: Points) -> str:
+        """Readable parameter values in mm, for messages and tables."""
+        pairs = zip(self.parameter_names, parameters, strict=True)
+        return ", ".join(f"{name} = {1000 * value:g} mm" for name, value in pairs)
+
+    def _grid(self, key: str, values: Mapping[str, Sequence[float]]) -> Points:
+        if set(values) != set(self.parameter_names):
+            raise ValueError(
+                f"part.{key} names {sorted(values)}, {self.name} has {sorted(self.parameter_names)}"
+            )
+        axes = [values[name] for name in reversed(self.parameter_names)]
+        grid = np.array([combination[::-1] for combination in product(*axes)], float) / 1000
+        for parameters in grid:
+            self.check_named(parameters)
+        return grid
+
+
+def pose_space_of_mesh(mesh: trimesh.Trimesh, symmetry: Symmetry) -> PoseSpace:
+    """Benchmark constants from a surface; see `ParametricPart.pose_space`.
+
+    Args:
+        mesh: surface in the part frame, metres; a revolution's axis is z.
+        symmetry: in the part frame.
+    """
+    area = mesh.area_faces / mesh.area
+    centre = area @ mesh.triangles_center
+    corners = mesh.triangles - centre
+    # second moment of a triangle: (Σ a_i a_iᵀ + s sᵀ) / 12 with s = Σ a_i
+    total = corners.sum(1)
+    moments = np.einsum("fki,fkj->fij", corners, corners) + np.einsum("fi,fj->fij", total, total)
+    covariance = np.einsum("f,fij->ij", area, moments) / 12
+    threshold = 0.2 * float(np.linalg.norm(mesh.vertices - centre, axis=1).max())
+    frame = np.eye(3)
+    if isinstance(symmetry, FiniteSymmetry):
+        values, vectors = np.linalg.eigh(covariance)
+        frame = (vectors * np.sign(np.linalg.det(vectors))).T
+        scale = torch.from_numpy(np.diag(np.sqrt(values)))
+        turned = torch.from_numpy(frame) @ symmetry.rotations @ torch.from_numpy(frame.T)
+        symmetry = FiniteSymmetry(turned)
+    else:
+        scale = torch.tensor(np.sqrt(covariance[0, 0] + covariance[2, 2]))
+    return PoseSpace(symmetry, scale, torch.from_numpy(frame), torch.from_numpy(-frame @ centre), threshold)

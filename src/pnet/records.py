@@ -1,0 +1,118 @@
+"""The few records that travel between rooms.
+
+Poses are part → camera; the camera frame has x right, y down, z forward; metres and radians.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pnet.geometry.camera import Camera
+
+
+@dataclass(frozen=True)
+class SceneId:
+    """Where a scene comes from.
+
+    Attributes:
+        split: "train", "val", "test_l" or "test_g". kind: "pile" or "clutter".
+        cycle: number of the cycle. part_index: the part object's place in its grid. drop: bodies dropped.
+    """
+
+    split: str
+    kind: str
+    cycle: int
+    part_index: int
+    drop: int
+
+    @property
+    def file_stem(self) -> str:
+        """Name of the cycle's file, without folder and ending."""
+        return f"{self.kind}_{self.cycle:04d}_part_{self.part_index:02d}"
+
+    def __str__(self) -> str:
+        return f"{self.split}/{self.file_stem}/{self.drop:03d}"
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One view of a pile: what the sensor sees and what is true.
+
+    Attributes:
+        points: (N, 3) float32, camera frame, metres, in farthest-point-sampling order.
+        instance: (N,) int64 index of the body that each point lies on, in [0, d).
+        R: (d, 3, 3), t: (d, 3) float64, part → camera, metres.
+        parameters: (d, k) float64 metres.
+        visibility: (d,) the paper's V = N_j / N_max over the image's pixels, in [0, 1].
+        occlusion: (d,) 1 − visible share of the body's own unclipped silhouette, in [0, 1].
+        camera: the view. part: the template's name. id: where it comes from.
+    """
+
+    points: NDArray[np.float32]
+    instance: NDArray[np.int64]
+    R: NDArray[np.float64]
+    t: NDArray[np.float64]
+    parameters: NDArray[np.float64]
+    visibility: NDArray[np.float64]
+    occlusion: NDArray[np.float64]
+    camera: Camera
+    part: str
+    id: SceneId
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """B scenes as a network and its losses take them.
+
+    Attributes:
+        points: (B, N, 3) camera frame, metres.
+        centroid: (B, N, 3) label: centroid of the instance that the point lies on, metres.
+        keypoints: (B, N, m, 3) label: its keypoints under the keypoint rule, metres.
+        parameters: (B, N, k) label: its parameters, metres.
+        visibility: (B, N) label: its visibility.
+        scene: (B,) index of each scene in the data set.
+    """
+
+    points: Tensor
+    centroid: Tensor
+    keypoints: Tensor
+    parameters: Tensor
+    visibility: Tensor
+    scene: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class PointPrediction:
+    """What a network says of every point.
+
+    Attributes:
+        centroid: (B, N, 3) metres, camera frame.
+        keypoints: (B, N, m, 3) metres, camera frame.
+        visibility: (B, N) in [0, 1], or None without M_V.
+    """
+
+    centroid: Tensor
+    keypoints: Tensor
+    visibility: Tensor | None
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """The instances found in one scene, best score first.
+
+    Attributes:
+        R: (d, 3, 3), t: (d, 3) part → camera, metres.
+        parameters: (d, k) metres.
+        score: (d,) higher is surer.
+        keypoints: (d, m, 3) voted keypoints, camera frame, metres.
+        instance: (N,) int64 index of the detection that each point was clustered to, −1 for none.
+    """
+
+    R: Tensor
+    t: Tensor
+    parameters: Tensor
+    score: Tensor
+    keypoints: Tensor
+    instance: Tensor
