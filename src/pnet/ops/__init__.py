@@ -1,0 +1,1 @@
+"""Sampling, grouping and interpolation on point clouds."""

@@ -1,0 +1,1 @@
+"""Synthetic scenes: physics, clutter, ray casting, sampling, the store and generation."""

@@ -1,0 +1,126 @@
+"""What a data set consists of: splits, part objects, cycles (Table I of the paper)."""
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pnet.records import SceneId
+
+SPLITS = ("train", "val", "test_l", "test_g")
+KINDS = ("pile", "clutter")
+
+
+@dataclass(frozen=True)
+class SplitPlan:
+    """One split.
+
+    Attributes:
+        grid: "L" (part objects that training sees) or "G" (others).
+        objects: indices into the grid, or None for all of them.
+        first_cycle, cycles: numbers of the cycles of piles; no two splits of one grid may share one.
+        clutter: share of clutter cycles, which come beside the piles, in [0, 1); training only.
+    """
+
+    grid: str
+    cycles: int
+    first_cycle: int = 0
+    objects: Sequence[int] | None = None
+    clutter: float = 0.0
+
+    @property
+    def clutter_cycles(self) -> int:
+        """Number of clutter cycles beside the piles."""
+        return round(self.cycles * self.clutter / (1 - self.clutter))
+
+
+@dataclass(frozen=True)
+class CycleTask:
+    """One file to make: a cycle of one part object."""
+
+    split: str
+    kind: str
+    grid: str
+    cycle: int
+    part_index: int
+
+    def scene_id(self, drop: int) -> SceneId:
+        """The id of the scene after `drop` bodies."""
+        return SceneId(self.split, self.kind, self.cycle, self.part_index, drop)
+
+    def rng(self, seed: int, part: str) -> np.random.Generator:
+        """The task's own generator: a pure function of seed, part, grid, part object, kind and cycle."""
+        key = (seed, zlib.crc32(part.encode()), zlib.crc32(self.grid.encode()))
+        return np.random.default_rng([*key, self.part_index, KINDS.index(self.kind), self.cycle])
+
+
+class Protocol:
+    """The plan of a data set.
+
+    Args:
+        name: for folders and tables. drop_limit: bodies dropped in a cycle.
+        drop_step: a scene is taken after every `drop_step` bodies.
+        points: N, points of a scene. splits: by name.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        drop_limit: int,
+        points: int,
+        splits: Mapping[str, SplitPlan],
+        drop_step: int = 1,
+    ) -> None:
+        if drop_limit < 1 or drop_step < 1 or points < 1:
+            raise ValueError(
+                f"protocol {name}: drop_limit, drop_step and points must be at least 1, got "
+                f"{drop_limit}, {drop_step}, {points}"
+            )
+        for split, plan in splits.items():
+            _check_split(name, split, plan)
+        self.name, self.drop_limit, self.drop_step, self.points = name, drop_limit, drop_step, points
+        self.splits = dict(splits)
+        self._check_disjoint()
+
+    def scene_drops(self) -> list[int]:
+        """Numbers of dropped bodies after which a scene is taken; the full bin always."""
+        return list(range(self.drop_limit, 0, -self.drop_step))[::-1]
+
+    def tasks(self, grid_sizes: Mapping[str, int]) -> list[CycleTask]:
+        """Every file of the data set, small splits first. grid_sizes: part objects of each grid."""
+        found = []
+        for split in sorted(self.splits, key=lambda s: s == "train"):
+            plan = self.splits[split]
+            objects = range(grid_sizes[plan.grid]) if plan.objects is None else plan.objects
+            for kind, count in (("pile", plan.cycles), ("clutter", plan.clutter_cycles)):
+                cycles = range(plan.first_cycle, plan.first_cycle + count)
+                found += [
+                    CycleTask(split, kind, plan.grid, cycle, index) for cycle in cycles for index in objects
+                ]
+        return found
+
+    def _check_disjoint(self) -> None:
+        taken: dict[tuple[str, int], str] = {}
+        for split, plan in self.splits.items():
+            for cycle in range(plan.first_cycle, plan.first_cycle + plan.cycles):
+                other = taken.setdefault((plan.grid, cycle), split)
+                if other != split:
+                    raise ValueError(
+                        f"protocol {self.name}: splits {other} and {split} share cycle {cycle} of grid "
+                        f"{plan.grid}; give them different first_cycle"
+                    )
+
+
+def _check_split(protocol: str, split: str, plan: SplitPlan) -> None:
+    where = f"protocol {protocol}, split {split}"
+    if split not in SPLITS:
+        raise ValueError(f"{where}: no such split, choose from {', '.join(SPLITS)}")
+    if plan.grid not in ("L", "G"):
+        raise ValueError(f"{where}: grid is {plan.grid!r}, choose L or G")
+    if plan.cycles < 1:
+        raise ValueError(f"{where}: cycles is {plan.cycles}, expected at least 1")
+    if not 0 <= plan.clutter < 1:
+        raise ValueError(f"{where}: clutter is {plan.clutter}, expected a share in [0, 1)")
+    if plan.clutter and split != "train":
+        raise ValueError(f"{where}: clutter belongs in training only, it would flatter a test")

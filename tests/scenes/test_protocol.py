@@ -1,0 +1,158 @@
+"""Table I as tasks, and what a plan may not say."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from pnet.cli.instantiate import instantiate
+from pnet.records import SceneId
+from pnet.scenes.protocol import CycleTask, Protocol, SplitPlan
+
+CONF = Path(__file__).parents[2] / "conf" / "protocol"
+TASK = CycleTask("train", "pile", "L", 3, 5)
+
+
+def protocol(drop_limit=3, drop_step=1, points=16, **splits) -> Protocol:
+    return Protocol("mine", drop_limit, points, splits, drop_step)
+
+
+def config(name: str) -> Protocol:
+    return instantiate(OmegaConf.load(CONF / f"{name}.yaml"))
+
+
+@pytest.mark.parametrize("objects", [64, 16])
+def test_the_paper_has_29_cycles_to_learn_from_and_one_for_each_test(objects):
+    """Table I: 64 part objects of TN06, 16 of TN34, 60 drops, 29 + 1 + 1 cycles."""
+    plan = config("paper")
+    tasks = plan.tasks({"L": objects, "G": objects})
+    counts = {split: sum(t.split == split for t in tasks) for split in plan.splits}
+    assert counts["train"] + counts["val"] == 29 * objects
+    assert counts["test_l"] == counts["test_g"] == objects
+    assert plan.scene_drops() == list(range(1, 61)) and plan.points == 16_384
+    assert {t.grid for t in tasks if t.split == "test_g"} == {"G"}
+    assert {t.kind for t in tasks} == {"pile"}
+
+
+def test_the_parametric_data_set_has_386_880_scenes():
+    """Three templates of 64 part objects and one of 16, 31 cycles, 60 drops each."""
+    plan = config("paper")
+    cycles = sum(len(plan.tasks({"L": n, "G": n})) for n in (64, 64, 64, 16))
+    assert cycles * len(plan.scene_drops()) == 386_880
+
+
+def test_a_split_of_some_objects_makes_those():
+    tasks = protocol(train=SplitPlan("L", cycles=2, objects=[0, 5])).tasks({"L": 64})
+    assert [(t.cycle, t.part_index) for t in tasks] == [(0, 0), (0, 5), (1, 0), (1, 5)]
+
+
+def test_small_splits_come_first():
+    plan = protocol(
+        train=SplitPlan("L", cycles=1), val=SplitPlan("L", cycles=1, first_cycle=1), test_g=SplitPlan("G", 1)
+    )
+    assert [t.split for t in plan.tasks({"L": 1, "G": 1})] == ["val", "test_g", "train"]
+
+
+def test_no_two_tasks_are_one_file():
+    plan = protocol(train=SplitPlan("L", cycles=3, clutter=0.5), val=SplitPlan("L", 1, first_cycle=3))
+    names = [(t.split, t.scene_id(0).file_stem) for t in plan.tasks({"L": 4})]
+    assert len(set(names)) == len(names) == 3 * 4 * 2 + 4
+
+
+@pytest.mark.parametrize(
+    ("cycles", "share", "clutter"), [(18, 0.63, 31), (1, 0.5, 1), (10, 0.0, 0), (3, 0.75, 9), (28, 0.2, 7)]
+)
+def test_clutter_is_that_share_of_all_cycles(cycles, share, clutter):
+    plan = SplitPlan("L", cycles, clutter=share)
+    assert plan.clutter_cycles == clutter
+    assert clutter / (clutter + cycles) == pytest.approx(share, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("limit", "step", "drops"),
+    [
+        (6, 1, [1, 2, 3, 4, 5, 6]),
+        (6, 4, [2, 6]),
+        (7, 3, [1, 4, 7]),
+        (5, 5, [5]),
+        (5, 9, [5]),
+        (1, 1, [1]),
+    ],
+)
+def test_the_full_bin_is_always_a_scene(limit, step, drops):
+    assert protocol(limit, step).scene_drops() == drops
+
+
+def test_the_same_task_draws_the_same_numbers():
+    first, again = (TASK.rng(0, "tn34").random(4) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        CycleTask("train", "clutter", "L", 3, 5),
+        CycleTask("train", "pile", "G", 3, 5),
+        CycleTask("train", "pile", "L", 4, 5),
+        CycleTask("train", "pile", "L", 3, 6),
+        CycleTask("val", "pile", "L", 5, 3),
+    ],
+)
+def test_another_task_draws_other_numbers(other):
+    assert TASK.rng(0, "tn34").random() != other.rng(0, "tn34").random()
+
+
+def test_another_seed_or_part_draws_other_numbers():
+    numbers = {TASK.rng(seed, part).random() for seed in (0, 1) for part in ("tn34", "tn06")}
+    assert len(numbers) == 4
+
+
+def test_splits_draw_different_numbers():
+    """Splits share no cycle of a grid, so no scene of one is a scene of another."""
+    for name in ("paper", "demo", "smoke"):
+        tasks = config(name).tasks({"L": 12, "G": 12})
+        numbers = {t.rng(0, "tn34").random() for t in tasks}
+        assert len(numbers) == len(tasks)
+
+
+def test_a_task_names_its_scenes():
+    assert TASK.scene_id(7) == SceneId("train", "pile", 3, 5, 7)
+
+
+def test_splits_that_share_a_cycle_are_refused():
+    with pytest.raises(ValueError, match="protocol mine: splits train and val share cycle 4 of grid L"):
+        protocol(train=SplitPlan("L", cycles=5), val=SplitPlan("L", cycles=1, first_cycle=4))
+
+
+def test_splits_of_different_grids_may_share_a_cycle():
+    protocol(test_l=SplitPlan("L", cycles=1), test_g=SplitPlan("G", cycles=1))
+
+
+def test_clutter_outside_training_is_refused():
+    with pytest.raises(ValueError, match="protocol mine, split val: clutter belongs in training only"):
+        protocol(val=SplitPlan("L", cycles=1, clutter=0.5))
+
+
+@pytest.mark.parametrize(
+    ("splits", "message"),
+    [
+        ({"test": SplitPlan("L", 1)}, "split test: no such split, choose from train, val, test_l, test_g"),
+        ({"train": SplitPlan("X", 1)}, "split train: grid is 'X', choose L or G"),
+        ({"train": SplitPlan("L", 0)}, "split train: cycles is 0, expected at least 1"),
+        (
+            {"train": SplitPlan("L", 1, clutter=1.0)},
+            r"split train: clutter is 1.0, expected a share in \[0, 1\)",
+        ),
+        ({"train": SplitPlan("L", 1, clutter=-0.1)}, "split train: clutter is -0.1"),
+    ],
+)
+def test_a_split_that_makes_no_sense_is_named(splits, message):
+    with pytest.raises(ValueError, match=f"protocol mine, {message}"):
+        protocol(**splits)
+
+
+@pytest.mark.parametrize(("limit", "step", "points"), [(0, 1, 1), (1, 0, 1), (1, 1, 0)])
+def test_counts_below_one_are_refused(limit, step, points):
+    with pytest.raises(ValueError, match=f"at least 1, got {limit}, {step}, {points}"):
+        protocol(limit, step, points)
