@@ -1,0 +1,117 @@
+"""The scores of a run, gathered scene by scene."""
+
+import math
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+
+from pnet.geometry.pose_space import PoseSpace
+from pnet.metrics.average_precision import (
+    PrecisionRecallCurve,
+    average_precision,
+    best_f1,
+    count_positives,
+    mean_average_precision,
+    precision_recall_curve,
+    recall_at_precision,
+)
+from pnet.metrics.matching import SceneMatch, ScoredPoses, TruePoses, match_scene, nearest_matches
+from pnet.metrics.pose_error import axis_error, parameter_error, position_error
+
+_FIELDS = ("score", "truth", "distance", "matched", "relevant")
+_ERRORS = ("position", "axis", "parameter")
+
+
+class PoseMetrics(Metric):
+    """Average precision and the errors of matched poses.
+
+    `compute()` gives AP, MAP, F1, recall_at_precision_99; position_error_mm, axis_error_deg and
+    parameter_error_mm, means over the relevant true poses' nearest matched results, NaN where there
+    is none; and the counts true_positives, false_positives (every result a positive),
+    truths_to_find, results, scenes.
+
+    Note:
+        For a single process: gathering over processes would join the scenes of each.
+    """
+
+    is_differentiable = False
+    higher_is_better = True
+    full_state_update = False
+
+    def __init__(self, max_occlusion: float = 0.5) -> None:
+        """
+        Args:
+            max_occlusion: a true pose that is more occluded than this counts neither way.
+        """
+        super().__init__()
+        self.max_occlusion = max_occlusion
+        for name in _FIELDS + _ERRORS:
+            self.add_state(name, default=[], dist_reduce_fx=None)
+
+    def update(
+        self,
+        space: PoseSpace,
+        truth: TruePoses,
+        results: ScoredPoses,
+        truth_parameters: Tensor | None = None,
+        result_parameters: Tensor | None = None,
+    ) -> None:
+        """Add one scene.
+
+        Args:
+            space: the pose distance of the scene's part object.
+            truth_parameters: (m, k), result_parameters: (n, k) metres; both or neither.
+        """
+        if (truth_parameters is None) != (result_parameters is None):
+            raise ValueError("parameters are given for the truth or the results only, expected both")
+        match = match_scene(space, truth, results, self.max_occlusion)
+        for name in _FIELDS:
+            getattr(self, name).append(getattr(match, name))
+        i, j = nearest_matches(match)
+        self._append_pose_errors(space, truth, results, i, j)
+        if truth_parameters is not None and result_parameters is not None:
+            error = parameter_error(truth_parameters.cpu()[i], result_parameters.cpu()[j])
+            self._states("parameter").append(error.flatten().double())
+
+    def compute(self) -> dict[str, float]:
+        """All numbers; the names say the units."""
+        matches, curve = self._matches(), self.curve()
+        true, false = count_positives(matches)
+        return {
+            "AP": average_precision(curve),
+            "MAP": mean_average_precision(matches),
+            "F1": best_f1(curve),
+            "recall_at_precision_99": recall_at_precision(curve),
+            "position_error_mm": 1000 * self._mean("position"),
+            "axis_error_deg": math.degrees(self._mean("axis")),
+            "parameter_error_mm": 1000 * self._mean("parameter"),
+            "true_positives": true,
+            "false_positives": false,
+            "truths_to_find": sum(int(m.relevant.sum()) for m in matches),
+            "results": sum(len(m.score) for m in matches),
+            "scenes": len(matches),
+        }
+
+    def curve(self) -> PrecisionRecallCurve:
+        """Precision and recall over the score threshold."""
+        return precision_recall_curve(self._matches())
+
+    def _append_pose_errors(
+        self, space: PoseSpace, truth: TruePoses, results: ScoredPoses, i: Tensor, j: Tensor
+    ) -> None:
+        Ra, ta, Rb, tb = truth.R[i], truth.t[i], results.R[j], results.t[j]
+        self._states("position").append(position_error(space, Ra, ta, Rb, tb))
+        self._states("axis").append(axis_error(space, Ra, Rb))
+
+    def _states(self, name: str) -> list[Tensor]:
+        return getattr(self, name)
+
+    def _matches(self) -> list[SceneMatch]:
+        # the states follow the module to a device, scoring stays on the CPU
+        rows = zip(*(self._states(name) for name in _FIELDS), strict=True)
+        return [SceneMatch(*(field.cpu() for field in row)) for row in rows]
+
+    def _mean(self, name: str) -> float:
+        values = self._states(name)
+        return float(torch.cat(values).mean()) if values else math.nan

@@ -1,0 +1,106 @@
+"""The gathered scores of a run."""
+
+import math
+
+import pytest
+import roma
+import torch
+
+from pnet.geometry.pose_space import PoseSpace
+from pnet.geometry.symmetry import RevolutionSymmetry
+from pnet.metrics.matching import ScoredPoses, TruePoses
+from pnet.metrics.pose_metric import PoseMetrics
+
+EYE = torch.eye(3, dtype=torch.float64)
+SPACE = PoseSpace(RevolutionSymmetry(), 0.01 * EYE[0, 0], EYE, 0 * EYE[0], 0.005)
+
+
+def tilt(degrees: float) -> torch.Tensor:
+    return roma.rotvec_to_rotmat(math.radians(degrees) * EYE[0])
+
+
+def truth() -> TruePoses:
+    """Two poses to find and a hidden one, 0.1 m apart."""
+    t = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]])
+    return TruePoses(EYE.expand(3, 3, 3), t, torch.tensor([0.0, 0.5, 0.9]))
+
+
+def results() -> ScoredPoses:
+    """Two results on the first pose, the nearer one less sure; the hidden pose; a stray."""
+    t = torch.tensor([[0.0, 0, 0.004], [0.0, 0, 0.001], [0.2, 0, 0], [0.5, 0, 0]])
+    R = torch.stack([EYE, tilt(2.0), EYE, EYE])
+    return ScoredPoses(R, t, torch.tensor([0.9, 0.8, 0.7, 0.6]))
+
+
+def nothing() -> ScoredPoses:
+    return ScoredPoses(torch.empty(0, 3, 3), torch.empty(0, 3), torch.empty(0))
+
+
+def test_one_scene_by_hand():
+    metric = PoseMetrics()
+    k_true, k_found = torch.full((3, 2), 0.010), torch.full((4, 2), 0.011)
+    k_found[1] = torch.tensor([0.012, 0.007])
+    metric.update(SPACE, truth(), results(), k_true, k_found)
+    scores = metric.compute()
+    assert scores == pytest.approx(
+        {
+            "AP": 0.5,
+            "MAP": 0.5,
+            "F1": 2 / 3,
+            "recall_at_precision_99": 0.5,
+            "position_error_mm": 1.0,
+            "axis_error_deg": 2.0,
+            "parameter_error_mm": 2.5,
+            "true_positives": 1,
+            "false_positives": 2,
+            "truths_to_find": 2,
+            "results": 4,
+            "scenes": 1,
+        },
+        rel=1e-5,
+    )
+    assert metric.curve().precision == pytest.approx([1, 1, 1 / 2, 1 / 2, 1 / 3])
+
+
+def test_scenes_are_averaged_and_reset_forgets_them():
+    metric = PoseMetrics()
+    metric.update(SPACE, truth(), results())
+    metric.update(SPACE, truth(), nothing())
+    assert metric.compute()["AP"] == pytest.approx(0.25)
+    assert metric.compute()["scenes"] == 2
+    metric.reset()
+    metric.update(SPACE, truth(), results())
+    assert metric.compute()["AP"] == pytest.approx(0.5)
+
+
+def test_the_forward_call_gives_one_scene_and_keeps_all():
+    metric = PoseMetrics()
+    assert metric(SPACE, truth(), results())["AP"] == pytest.approx(0.5)
+    assert metric(SPACE, truth(), nothing())["AP"] == 0
+    assert metric.compute()["AP"] == pytest.approx(0.25)
+
+
+def test_errors_are_nan_where_nothing_matched():
+    metric = PoseMetrics()
+    metric.update(SPACE, truth(), nothing())
+    scores = metric.compute()
+    for name in ("position_error_mm", "axis_error_deg", "parameter_error_mm"):
+        assert math.isnan(scores[name])
+    assert (scores["AP"], scores["results"], scores["truths_to_find"]) == (0, 0, 2)
+
+
+def test_the_occlusion_limit_is_a_setting():
+    metric = PoseMetrics(max_occlusion=0.95)
+    metric.update(SPACE, truth(), results())
+    assert metric.compute()["truths_to_find"] == 3
+    assert metric.compute()["true_positives"] == 2
+
+
+def test_parameters_on_one_side_only_are_refused():
+    with pytest.raises(ValueError, match="truth or the results only"):
+        PoseMetrics().update(SPACE, truth(), results(), truth_parameters=torch.zeros(3, 1))
+
+
+def test_no_scene_is_an_error():
+    with pytest.warns(UserWarning, match="compute"), pytest.raises(ValueError, match="no scene"):
+        PoseMetrics().compute()
