@@ -1,0 +1,1 @@
+"""From scenes to batches: labels, augmentation, data sets, the LightningDataModule."""

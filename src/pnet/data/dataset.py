@@ -1,0 +1,96 @@
+"""A torch Dataset of labelled scenes, and the order in which training sees them."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset, Sampler
+
+from pnet.data.augmentation import Augmentation
+from pnet.data.scene_folder import SceneFolder
+from pnet.data.targets import point_labels
+from pnet.parts.keypoints import KeypointChain, KeypointChoice
+from pnet.records import Batch, Scene
+
+Draw = tuple[int, int]  # scene index and epoch: all that chance depends on, besides the seed
+
+
+class LabelledScenes(Dataset[dict[str, Tensor]]):
+    """Scenes with labels, augmented by (seed, epoch, index) alone, so that a resumed run repeats itself.
+
+    Args:
+        scenes: where they come from. chain: the part's keypoints. choice: which equivalent is the label.
+        points: take the first so many of each scene's points (they are in sampling order), or None.
+        augmentation: for training, else None. seed: of the augmentation.
+    """
+
+    def __init__(
+        self,
+        scenes: SceneFolder,
+        chain: KeypointChain,
+        choice: KeypointChoice,
+        points: int | None = None,
+        augmentation: Augmentation | None = None,
+        seed: int = 0,
+    ) -> None:
+        if points is not None and points > scenes.points_per_scene:
+            raise ValueError(
+                f"data.points is {points}, the stored scenes have {scenes.points_per_scene}; "
+                "lower it or make the data with more points"
+            )
+        self.scenes, self.points = scenes, points
+        self._chain, self._choice = chain, choice
+        self._augmentation, self._seed = augmentation, seed
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def __getitem__(self, draw: Draw | int) -> dict[str, Tensor]:
+        index, epoch = (draw, 0) if isinstance(draw, int) else draw
+        scene = first_points(self.scenes[index], self.points)
+        if self._augmentation is not None:
+            scene = self._augmentation(scene, np.random.default_rng([self._seed, epoch, index]))
+        labels = point_labels(scene, self._chain, self._choice)
+        return {**labels, "scene": torch.tensor(index)}
+
+
+def first_points(scene: Scene, count: int | None) -> Scene:
+    """The scene with its first `count` points only; None keeps all."""
+    from dataclasses import replace
+
+    if count is None:
+        return scene
+    return replace(scene, points=scene.points[:count], instance=scene.instance[:count])
+
+
+def collate(items: list[dict[str, Tensor]]) -> Batch:
+    """Stack labelled scenes."""
+    return Batch(**{name: torch.stack([item[name] for item in items]) for name in items[0]})
+
+
+class EpochSampler(Sampler[Draw]):
+    """A new permutation each epoch, a pure function of (seed, epoch).
+
+    Args:
+        size: how many scenes there are. draws: how many make an epoch; None: each scene once.
+    """
+
+    def __init__(self, size: int, seed: int, draws: int | None = None) -> None:
+        self._size, self._seed, self._draws = size, seed, draws or size
+        self._epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Called by the trainer at the start of each epoch."""
+        self._epoch = epoch
+
+    def __len__(self) -> int:
+        return self._draws
+
+    def __iter__(self) -> Iterator[Draw]:
+        # an endless row of permutations, cut into epochs, so that every scene is seen equally often
+        for position in range(self._epoch * self._draws, (self._epoch + 1) * self._draws):
+            turn, place = divmod(position, self._size)
+            if place == 0 or position == self._epoch * self._draws:
+                order = np.random.default_rng([self._seed, turn]).permutation(self._size)
+            yield int(order[place]), self._epoch

@@ -1,0 +1,107 @@
+"""The LightningDataModule over pnet's own store."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from torch.utils.data import DataLoader
+
+from pnet.data.augmentation import Augmentation
+from pnet.data.dataset import EpochSampler, LabelledScenes, collate
+from pnet.data.scene_folder import SceneFolder
+from pnet.parts.base import ParametricPart
+from pnet.parts.keypoints import KeypointChoice, KeypointRule
+
+
+@dataclass(frozen=True)
+class Targets:
+    """How labels are made.
+
+    Attributes:
+        geometric_unique: GU, equation 1; False is the ablation "w/o GU".
+        direction: see `KeypointChoice`; the paper's is (0, 0, 1).
+    """
+
+    geometric_unique: bool = True
+    direction: Sequence[float] = (0.0, 0.0, 1.0)
+
+    @property
+    def choice(self) -> KeypointChoice:
+        """Which equivalent keypoint is the label."""
+        rule = KeypointRule.CAMERA if self.geometric_unique else KeypointRule.CANONICAL
+        x, y, z = self.direction if len(self.direction) == 3 else (0, 0, 0)
+        return KeypointChoice(rule, (x, y, z))
+
+
+class SceneDataModule(lightning.LightningDataModule):
+    """Loaders of the splits train, val, test_l, test_g.
+
+    Args:
+        part: what the scenes show. root: the data set's folder.
+        targets, augmentation: see their classes; augmentation in training only.
+        points: N, the first so many of a scene's points; None: all.
+        batch_size: scenes. draws: scenes of an epoch; None: each once.
+        val_every: keep every so many validation scenes. workers: loader processes. seed: of order and chance.
+    """
+
+    def __init__(
+        self,
+        part: ParametricPart,
+        root: str | Path,
+        targets: Targets,
+        augmentation: Augmentation,
+        points: int | None,
+        batch_size: int,
+        draws: int | None,
+        val_every: int,
+        workers: int,
+        seed: int,
+    ) -> None:
+        super().__init__()
+        if batch_size < 1:
+            raise ValueError(f"data.batch_size is {batch_size}, expected at least 1")
+        self.part, self.root, self.targets, self.points = part, Path(root), targets, points
+        self._augmentation, self._batch_size, self._draws = augmentation, batch_size, draws
+        self._val_every, self._workers, self._seed = val_every, workers, seed
+
+    def scenes(self, split: str, every: int = 1) -> SceneFolder:
+        """The scenes of a split."""
+        return SceneFolder(self.root, split, self.part.name, every)
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        """Training scenes, augmented, in an order that (seed, epoch) decides."""
+        scenes = self.scenes("train")
+        dataset = LabelledScenes(
+            scenes, self.part.chain, self.targets.choice, self.points, self._augmentation, self._seed
+        )
+        if (self._draws or len(scenes)) < self._batch_size:
+            raise ValueError(
+                f"data.batch_size is {self._batch_size}, but an epoch has only "
+                f"{self._draws or len(scenes)} scenes; lower it or raise data.draws"
+            )
+        sampler = EpochSampler(len(scenes), self._seed, self._draws)
+        return self._loader(dataset, sampler, drop_last=True)
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        """Validation scenes as they are."""
+        scenes = self.scenes("val", self._val_every)
+        dataset = LabelledScenes(scenes, self.part.chain, self.targets.choice, self.points)
+        return self._loader(dataset, None, drop_last=False)
+
+    def _loader(
+        self, dataset: LabelledScenes, sampler: EpochSampler | None, drop_last: bool
+    ) -> DataLoader[Any]:
+        return DataLoader(
+            dataset,
+            batch_size=self._batch_size,
+            sampler=sampler,
+            drop_last=drop_last,
+            num_workers=self._workers,
+            persistent_workers=self._workers > 0,
+            pin_memory=torch.cuda.is_available(),
+            collate_fn=collate,
+            generator=torch.Generator().manual_seed(self._seed),
+        )

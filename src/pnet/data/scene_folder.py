@@ -1,0 +1,67 @@
+"""The scenes of one split of pnet's own store, by index."""
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from itertools import accumulate
+from pathlib import Path
+
+from pnet.records import Scene, SceneId
+from pnet.scenes.store import SUFFIX, CycleFile
+
+
+class SceneFolder(Sequence[Scene]):
+    """All scenes of a split, read one by one.
+
+    Args:
+        root: the data set's folder. split: "train", "val", "test_l" or "test_g".
+        part: the template's name that the scenes must show.
+        every: keep every so many scenes only, counted from the end of each cycle.
+    Raises:
+        FileNotFoundError, ValueError: where the split is missing, empty, damaged or of another part.
+    """
+
+    def __init__(self, root: Path, split: str, part: str, every: int = 1) -> None:
+        self._paths = sorted((root / split).glob(f"[!.]*{SUFFIX}"))
+        if not self._paths:
+            raise FileNotFoundError(
+                f"{root / split}: no scenes there; run pnet-generate with the same part and protocol first"
+            )
+        files = [CycleFile(path) for path in self._paths]
+        for file in files:
+            if file.header.part != part:
+                raise ValueError(
+                    f"{file.path}: shows {file.header.part}, not {part}; set part={file.header.part} "
+                    "or another data.root"
+                )
+        self.points_per_scene = min(file.points_per_scene for file in files if len(file))
+        chosen = [list(range(len(file)))[::-1][::every][::-1] for file in files]
+        self._index = chosen
+        self._ends = list(accumulate(len(indices) for indices in chosen))
+        if not self._ends[-1]:
+            raise ValueError(f"{root / split}: its files hold no scene; make the data anew")
+        self._ids = [file.scene_id(i) for file, indices in zip(files, chosen, strict=True) for i in indices]
+        # opened again where they are read: file handles do not travel to the loader's workers
+        self._open: dict[Path, CycleFile] = {}
+
+    def __len__(self) -> int:
+        return self._ends[-1]
+
+    def __getitem__(self, index: int) -> Scene:  # type: ignore[override]
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        number = bisect_right(self._ends, index)
+        within = index - (self._ends[number - 1] if number else 0)
+        return self._file(self._paths[number]).scene(self._index[number][within])
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_open": {}}
+
+    @property
+    def ids(self) -> list[SceneId]:
+        """The scenes' ids, in order."""
+        return self._ids
+
+    def _file(self, path: Path) -> CycleFile:
+        if path not in self._open:
+            self._open[path] = CycleFile(path)
+        return self._open[path]

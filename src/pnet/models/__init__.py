@@ -1,0 +1,1 @@
+"""Heads, losses and the networks that put them on a backbone."""
