@@ -1,0 +1,136 @@
+"""What every command shares: where configs are, clear errors, exit codes."""
+
+import difflib
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+import hydra
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+Task = Callable[[DictConfig], None]
+TRACEBACK = "PNET_TRACEBACK"  # set it to 1 to see where an error comes from
+
+
+def config_dir() -> Path:
+    """The folder of config groups: inside an installed package, or beside `src` in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "conf", package.parents[1] / "conf"):
+        if (folder / "generate.yaml").is_file():
+            return folder
+    raise FileNotFoundError(f"pnet's config files are missing beside {package}; install pnet again")
+
+
+def run_name(*words: str) -> str:
+    """A run folder's name: the words that say something, joined."""
+    return "_".join(word for word in words if word).replace("/", "-")
+
+
+OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+
+
+def run_app(task: Task, config_name: str) -> None:
+    """Run a command: compose its config, call the task, turn errors into one line and an exit code."""
+    try:
+        folder = config_dir()
+        _explain_bad_overrides(folder, config_name, sys.argv[1:])
+    except (HydraException, OmegaConfBaseException, OSError, ValueError) as fault:
+        fail(fault)
+    decorate = hydra.main(version_base="1.3", config_path=str(folder), config_name=config_name)
+    decorate(_guarded(task))()
+
+
+def fail(fault: BaseException) -> NoReturn:
+    """Print one clear line and leave with exit code 1."""
+    if os.environ.get(TRACEBACK) == "1":
+        raise fault
+    text = " ".join(str(fault).split()) or type(fault).__name__
+    if isinstance(fault, OSError) and fault.filename and not str(fault).startswith(str(fault.filename)):
+        text = f"{fault.filename}: {fault.strerror}"
+    print(f"error: {text}", file=sys.stderr)
+    sys.exit(1)
+
+
+def _guarded(task: Task) -> Task:
+    def guarded(cfg: DictConfig) -> None:
+        try:
+            task(cfg)
+        except KeyboardInterrupt:
+            print("interrupted: the same command goes on where this one stopped", file=sys.stderr)
+            sys.exit(130)
+        except (
+            ValueError,
+            OSError,
+            ModuleNotFoundError,
+            HydraException,
+            OmegaConfBaseException,
+        ) as fault:
+            fail(fault)
+
+    return guarded
+
+
+def _explain_bad_overrides(folder: Path, config_name: str, arguments: list[str]) -> None:
+    """Raise ValueError that names close keys or choices where an override does not fit."""
+    flags_with_value = {"--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn"}
+    if flags_with_value & {a.split("=")[0] for a in arguments}:
+        return  # the user brings configs of his own; Hydra itself checks them
+    words = [a for a in arguments if "=" in a and not a.startswith("-")]
+    overrides = OverridesParser.create().parse_overrides(words)
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(folder), version_base="1.3"):
+        good: list[str] = []
+        for override in overrides:
+            if (override.key_or_group or "").startswith("hydra"):
+                continue
+            trial = _first_choice(override)
+            try:
+                compose(config_name, overrides=[*good, trial], return_hydra_config=True)
+            except (HydraException, OmegaConfBaseException) as fault:
+                raise ValueError(_hint(folder, config_name, override, good, fault)) from fault
+            good.append(trial)
+    GlobalHydra.instance().clear()
+
+
+def _first_choice(override: Override) -> str:
+    text = override.input_line or ""
+    if not override.is_sweep_override():
+        return text
+    first = next(iter(override.sweep_string_iterator()))
+    return f"{text.split('=')[0]}={first}"
+
+
+def _hint(folder: Path, config_name: str, override: Override, good: list[str], fault: Exception) -> str:
+    key, value = override.key_or_group or "", str(override.value())
+    choices = sorted(path.stem for path in (folder / key).glob("*.yaml")) if key else []
+    if choices and value not in choices:
+        return f"{key}={value}: no such choice{_close(value, choices)}; there are {', '.join(choices)}"
+    cfg = compose(config_name, overrides=good)
+    groups = [path.name for path in folder.iterdir() if path.is_dir()]
+    keys = [*_keys(OmegaConf.to_container(cfg)), *groups]
+    if key not in keys:
+        return f"{key}: unknown key{_close(key, keys)}; `{Path(sys.argv[0]).name} --cfg job` lists all keys"
+    return f"{override.input_line}: {str(fault).splitlines()[0]}"
+
+
+def _close(word: str, known: list[str]) -> str:
+    found = difflib.get_close_matches(word, known, n=3, cutoff=0.5)
+    tail = word.rsplit(".", 1)[-1]
+    found = found or [k for k in known if k.rsplit(".", 1)[-1] == tail][:3]
+    return f", did you mean {' or '.join(found)}?" if found else ""
+
+
+def _keys(node: Any, path: str = "") -> Iterator[str]:
+    if path:
+        yield path
+    if isinstance(node, dict):
+        for name, child in node.items():
+            yield from _keys(child, f"{path}.{name}" if path else str(name))

@@ -1,0 +1,122 @@
+"""Objects out of a config: what training and evaluation share."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from pnet.cli.instantiate import instantiate
+from pnet.data.module import SceneDataModule
+from pnet.models.parametricnet import ParametricNet
+from pnet.parts.base import ParametricPart
+from pnet.postprocess.pipeline import PoseRecovery
+
+if TYPE_CHECKING:
+    from pnet.engine.estimator import NetworkEstimator
+
+CONFIG = "config.yaml"  # a run's settings as they were given, interpolations and all
+RESOLVED = "resolved.yaml"  # the same, resolved: what evaluation reads
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The pieces of a run."""
+
+    part: ParametricPart
+    network: ParametricNet
+    recovery: PoseRecovery
+
+
+def build_parts(cfg: DictConfig) -> Parts:
+    """Part, network and recovery of a config; the network's weights are drawn from its seed."""
+    torch.manual_seed(cfg.seed)
+    part: ParametricPart = instantiate(cfg.part)
+    backbone = instantiate(cfg.backbone)
+    network = instantiate(cfg.model, backbone=backbone, keypoints=len(part.chain))
+    return Parts(part, network.to(memory_format=torch.channels_last), instantiate(cfg.postprocess))
+
+
+def build_data(cfg: DictConfig, part: ParametricPart) -> SceneDataModule:
+    """The data module of a config; an epoch lasts from one checkpoint to the next."""
+    return SceneDataModule(
+        part,
+        cfg.data.root,
+        instantiate(cfg.data.targets),
+        instantiate(cfg.data.augmentation),
+        cfg.data.points,
+        cfg.data.batch_size,
+        cfg.trainer.checkpoint_every * cfg.data.batch_size,
+        cfg.data.val_every,
+        cfg.data.workers,
+        cfg.seed,
+    )
+
+
+def identity(cfg: DictConfig) -> dict[str, str]:
+    """What weights belong to: part, network and data, as text that can be compared."""
+    return {
+        "part": str(cfg.part._target_).rsplit(".", 1)[-1].lower(),
+        "backbone": OmegaConf.to_yaml(cfg.backbone, resolve=True),
+        "model": OmegaConf.to_yaml(cfg.model, resolve=True),
+    }
+
+
+def use_bf16(precision: str) -> bool:
+    """Whether to run the network in bfloat16.
+
+    Args:
+        precision: "32", "bf16" or "auto": bf16 on a GPU or where the processor multiplies it in hardware.
+    """
+    if precision not in ("32", "bf16", "auto"):
+        raise ValueError(f"trainer.precision is {precision!r}, choose 32, bf16 or auto")
+    if precision != "auto":
+        return precision == "bf16"
+    return torch.cuda.is_available() or bool(torch.cpu._is_avx512_bf16_supported())
+
+
+def read_run(run: Path) -> DictConfig:
+    """The resolved config of a run folder.
+
+    Raises:
+        FileNotFoundError, ValueError: where it is no run of pnet-train; names the file.
+    """
+    path = run / RESOLVED
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; give a folder that pnet-train made as run=")
+    try:
+        cfg = OmegaConf.load(path)
+    except Exception as fault:  # yaml raises classes of its own
+        raise ValueError(f"{path}: not readable ({' '.join(str(fault).split())})") from fault
+    if not isinstance(cfg, DictConfig) or "part" not in cfg:
+        raise ValueError(f"{path}: not the settings of a training")
+    return cfg
+
+
+def load_estimator(run: Path) -> tuple[DictConfig, "NetworkEstimator"]:
+    """The trained estimator of a run folder, and its config."""
+    from pnet.engine.checkpoints import NAME, read_checkpoint
+    from pnet.engine.estimator import NetworkEstimator
+    from pnet.engine.training import check_identity
+
+    cfg = read_run(run)
+    checkpoint = run / "checkpoints" / NAME
+    content = read_checkpoint(checkpoint)
+    try:
+        check_identity(content, identity(cfg))
+        parts = build_parts(cfg)
+        prefix = "network."
+        weights = {
+            name.removeprefix(prefix): value
+            for name, value in content["state_dict"].items()
+            if name.startswith(prefix)
+        }
+        parts.network.load_state_dict(weights)
+    except (RuntimeError, ValueError, OmegaConfBaseException) as fault:
+        raise ValueError(f"{checkpoint}: {fault}") from fault
+    device = "cuda" if torch.cuda.is_available() and cfg.trainer.accelerator != "cpu" else "cpu"
+    network = parts.network.to(device).eval()
+    bf16 = use_bf16(cfg.trainer.precision)
+    return cfg, NetworkEstimator(parts.part, network, parts.recovery, bf16)

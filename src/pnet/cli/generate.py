@@ -1,0 +1,91 @@
+"""pnet-generate: make a data set."""
+
+import os
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from pnet.cli.app import run_app
+
+if TYPE_CHECKING:
+    from pnet.scenes.factory import SceneFactory
+    from pnet.scenes.generation import Summary
+
+# what decides a scene's bytes; the rest (workers, folders) does not
+MAKING = ("part", "protocol", "camera", "bin", "physics", "seed", "camera_height", "clutter_spacing")
+
+
+def main() -> None:
+    """Entry point."""
+    run_app(generate_data, "generate")
+
+
+def generate_data(cfg: DictConfig) -> None:
+    """Make what is missing of the data set, with a progress bar and a summary."""
+    from pnet.reporting.progress import scene_progress
+    from pnet.scenes.generation import Summary, generate, open_root
+
+    settings = making_settings(cfg)
+    factory = build_factory(cfg, settings)
+    root = Path(cfg.data.root)
+    open_root(root, settings)
+    grid_sizes = {name: len(grid) for name, grid in factory.part.grids.items()}
+    tasks = factory.protocol.tasks(grid_sizes)
+    workers = os.cpu_count() or 1 if cfg.workers is None else cfg.workers
+    summary, start = Summary(), perf_counter()
+    with scene_progress(len(tasks), len(factory.protocol.scene_drops())) as advance:
+        for report in generate(factory, root, tasks, workers):
+            if report is None:
+                summary.kept += 1
+            else:
+                summary.add(report)
+            advance(report is not None)
+    summary.seconds = perf_counter() - start
+    print_summary(root, summary)
+
+
+def making_settings(cfg: DictConfig) -> dict[str, Any]:
+    """The settings that decide what the scenes are, as plain values."""
+    settings = OmegaConf.to_container(OmegaConf.masked_copy(cfg, list(MAKING)), resolve=True)
+    assert isinstance(settings, dict)
+    return {str(key): value for key, value in settings.items()}
+
+
+def build_factory(cfg: DictConfig, settings: dict[str, Any]) -> "SceneFactory":
+    """Everything that scenes are made from, out of the config."""
+    from pnet.cli.instantiate import instantiate
+    from pnet.scenes.factory import SceneFactory
+    from pnet.scenes.generation import settings_fingerprint
+
+    return SceneFactory(
+        part=instantiate(cfg.part),
+        protocol=instantiate(cfg.protocol),
+        camera=instantiate(cfg.camera),
+        box=instantiate(cfg.bin),
+        physics=instantiate(cfg.physics),
+        camera_height=cfg.camera_height,
+        clutter_spacing=cfg.clutter_spacing,
+        seed=cfg.seed,
+        fingerprint=settings_fingerprint(settings),
+    )
+
+
+def print_summary(root: Path, summary: "Summary") -> None:
+    """What was made, how fast, and what went wrong with it."""
+    from rich.console import Console
+
+    out = Console(soft_wrap=True)
+    out.print(f"{summary.made} cycles made, {summary.kept} were there; data set in {root}")
+    if not summary.scenes:
+        return
+    rate = summary.scenes / summary.seconds
+    out.print(f"{summary.scenes} scenes in {summary.seconds:.1f} s: {rate:.1f} scenes/s")
+    stages = vars(summary.times).items()
+    times = ", ".join(f"{name} {1000 * s / summary.scenes:.0f}" for name, s in stages)
+    out.print(f"milliseconds a scene and worker: {times}")
+    out.print(
+        f"{summary.escaped} bodies left the bin and were removed, {summary.unsettled} scenes were not "
+        f"at rest in time, {summary.empty} scenes showed no body and were left out"
+    )

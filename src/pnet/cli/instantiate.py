@@ -1,0 +1,56 @@
+"""Build objects from configs, from an allowlist only: a config file is data, not code."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import hydra
+from hydra.utils import get_object
+from omegaconf import DictConfig, OmegaConf
+
+ALLOWED = (
+    "pnet.geometry.camera.",
+    "pnet.parts.",
+    "pnet.scenes.",
+    "pnet.data.",
+    "pnet.backbones.",
+    "pnet.models.",
+    "pnet.postprocess.",
+    "pnet.engine.schedules.",
+    "torch.optim.",
+)
+
+
+def instantiate(node: DictConfig, *args: Any, **kwargs: Any) -> Any:
+    """`hydra.utils.instantiate`, after every `_target_` in the node was found on the allowlist.
+
+    Raises:
+        ValueError: names the key and the target that is not allowed or does not exist.
+    """
+    for key, target in _targets(OmegaConf.to_container(node, resolve=True)):
+        _check(key, target)
+    return hydra.utils.instantiate(node, *args, _convert_="all", **kwargs)
+
+
+def _check(key: str, target: str) -> None:
+    where = f"{key or 'config'}._target_: {target}"
+    if not target.startswith(ALLOWED):
+        raise ValueError(f"{where} is not allowed; pnet builds only from {', '.join(ALLOWED)}")
+    try:
+        found = get_object(target)
+    except Exception as fault:
+        raise ValueError(f"{where} does not exist ({fault})") from fault
+    # a name that is only imported there may be anything: judge the object by where it was defined
+    home = f"{found.__module__}.{found.__qualname__}"
+    if not (isinstance(found, type) or callable(found)) or not home.startswith(ALLOWED):
+        raise ValueError(f"{where} is {home}, which is not allowed")
+
+
+def _targets(node: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    if isinstance(node, dict):
+        if "_target_" in node:
+            yield key, str(node["_target_"])
+        for name, child in node.items():
+            yield from _targets(child, f"{key}.{name}" if key else str(name))
+    elif isinstance(node, list):
+        for i, child in enumerate(node):
+            yield from _targets(child, f"{key}[{i}]")

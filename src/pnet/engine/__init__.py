@@ -1,0 +1,1 @@
+"""Training, the estimator that every method satisfies, callbacks, provenance."""

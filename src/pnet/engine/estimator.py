@@ -1,0 +1,67 @@
+"""What evaluation, prediction and tables know of a method: scenes in, detections out."""
+
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from pnet.models.parametricnet import ParametricNet
+from pnet.parts.base import ParametricPart
+from pnet.postprocess.pipeline import PoseRecovery, no_detections
+from pnet.records import Detections
+
+
+@dataclass
+class Timing:
+    """Seconds spent on scenes so far."""
+
+    scenes: int = 0
+    network: float = 0.0
+    postprocess: float = 0.0
+
+
+class Estimator(Protocol):
+    """Finds the instances of a part in point clouds; learned or classical."""
+
+    part: ParametricPart
+    timing: Timing
+
+    def estimate(self, points: Tensor) -> list[Detections]:
+        """Detections of each cloud. points: (B, N, 3) camera frame, metres."""
+        ...
+
+
+@dataclass
+class NetworkEstimator:
+    """A trained network and the recovery of poses from its predictions."""
+
+    part: ParametricPart
+    network: ParametricNet
+    recovery: PoseRecovery
+    bf16: bool = False
+    timing: Timing = field(default_factory=Timing)
+
+    @torch.no_grad()
+    def estimate(self, points: Tensor) -> list[Detections]:
+        """Detections of each cloud; none where a cloud has no point."""
+        if points.shape[1] == 0:
+            return [no_detections(self.part, 0) for _ in points]
+        if not bool(torch.isfinite(points).all()):
+            raise ValueError("the cloud has NaN or infinite coordinates; remove those points first")
+        device = next(self.network.parameters()).device
+        training = self.network.training
+        self.network.eval()
+        start = perf_counter()
+        with torch.autocast(device.type, torch.bfloat16, enabled=self.bf16):
+            prediction = self.network(points.to(device))
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        middle = perf_counter()
+        found = [self.recovery(self.part, prediction, i) for i in range(len(points))]
+        self.timing.network += middle - start
+        self.timing.postprocess += perf_counter() - middle
+        self.timing.scenes += len(points)
+        self.network.train(training)
+        return found

@@ -1,0 +1,76 @@
+"""Evaluation in two steps: predict, then score what was predicted."""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+
+import torch
+
+from pnet.engine.estimator import Estimator
+from pnet.geometry.pose_space import PoseSpace
+from pnet.metrics.matching import ScoredPoses, TruePoses
+from pnet.metrics.pose_metric import PoseMetrics
+from pnet.parts.base import ParametricPart
+from pnet.records import Detections, Scene
+
+
+def predict_scenes(
+    estimator: Estimator,
+    scenes: Sequence[Scene],
+    points: int | None,
+    advance: Callable[[int], None] = lambda scenes: None,
+) -> list[Detections]:
+    """Detections of every scene.
+
+    Args:
+        estimator: any method. scenes: in order. points: N, the first so many of a scene's; None: all.
+        advance: called with the number of scenes done, after each.
+    """
+    found = []
+    for index in range(len(scenes)):
+        cloud = torch.from_numpy(scenes[index].points[:points])
+        found += estimator.estimate(cloud[None])
+        advance(1)
+    return found
+
+
+class SceneScorer:
+    """Scores detections against truth, over all scenes and for each part object (the paper's mAP).
+
+    Args:
+        part: the template; its pose distance depends on a scene's parameters.
+    """
+
+    def __init__(self, part: ParametricPart) -> None:
+        self._part = part
+        self._spaces: dict[bytes, PoseSpace] = {}
+        self.metrics = PoseMetrics()
+        self._by_object: dict[bytes, PoseMetrics] = defaultdict(PoseMetrics)
+
+    def add(self, scene: Scene, found: Detections) -> None:
+        """Count one scene; all its bodies are of one part object."""
+        key = scene.parameters[:1].tobytes()
+        truth = TruePoses(
+            torch.from_numpy(scene.R), torch.from_numpy(scene.t), torch.from_numpy(scene.occlusion)
+        )
+        results = ScoredPoses(found.R, found.t, found.score)
+        parameters = torch.from_numpy(scene.parameters)
+        for metrics in (self.metrics, self._by_object[key]):
+            metrics.update(self._space(scene), truth, results, parameters, found.parameters)
+
+    def add_all(self, scenes: Iterable[Scene], found: Iterable[Detections]) -> "SceneScorer":
+        """Count many scenes."""
+        for scene, detections in zip(scenes, found, strict=True):
+            self.add(scene, detections)
+        return self
+
+    def compute(self) -> dict[str, float]:
+        """All metrics, and mAP, the mean of the part objects' AP."""
+        values: dict[str, float] = self.metrics.compute()
+        each = [float(metrics.compute()["AP"]) for metrics in self._by_object.values()]
+        return {**values, "mAP": sum(each) / len(each) if each else float("nan")}
+
+    def _space(self, scene: Scene) -> PoseSpace:
+        key = scene.parameters[:1].tobytes()
+        if key not in self._spaces:
+            self._spaces[key] = self._part.pose_space(scene.parameters[0])
+        return self._spaces[key]

@@ -1,0 +1,100 @@
+"""The LightningModule: losses in, weights out."""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import lightning
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+from pnet.engine.schedules import Schedule
+from pnet.models.losses import ParametricLoss
+from pnet.models.parametricnet import ParametricNet
+from pnet.records import Batch
+
+Optimization = Callable[[Iterable[Parameter]], Optimizer]
+
+
+class PoseTraining(lightning.LightningModule):
+    """Trains a network on labelled scenes.
+
+    Args:
+        network: points to predictions. loss: predictions and labels to losses.
+        optimizer: makes an optimiser of parameters. schedule: learning rate by step.
+        bf16: run the network in bfloat16 autocast.
+        identity: plain values kept in every checkpoint, by which `check_identity` knows its own.
+    """
+
+    def __init__(
+        self,
+        network: ParametricNet,
+        loss: ParametricLoss,
+        optimizer: Optimization,
+        schedule: Schedule,
+        bf16: bool,
+        identity: dict[str, str],
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.loss = loss
+        self._optimizer, self._schedule = optimizer, schedule
+        self._bf16, self._identity = bf16, identity
+
+    def training_step(self, batch: Batch, index: int) -> Tensor:
+        """Loss of a batch; each module's own is logged."""
+        losses = self._losses(batch)
+        self._log("train", losses, len(batch.points))
+        return losses["loss"]
+
+    def validation_step(self, batch: Batch, index: int) -> None:
+        """Losses on validation scenes."""
+        self._log("val", self._losses(batch), len(batch.points))
+
+    def configure_optimizers(self) -> Any:
+        """The optimiser and its schedule, stepped after every batch."""
+        optimizer = self._optimizer(self.network.parameters())
+        total = int(self.trainer.estimated_stepping_batches)
+        schedule = LambdaLR(optimizer, lambda step: self._schedule.factor(step, total))
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": schedule, "interval": "step"},
+        }
+
+    def transfer_batch_to_device(self, batch: Batch, device: torch.device, index: int) -> Batch:
+        """Lightning knows no frozen records: move each tensor."""
+        moved = {k: v.to(device, non_blocking=True) for k, v in vars(batch).items()}
+        return Batch(**moved)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keep what the weights belong to."""
+        checkpoint["pnet"] = dict(self._identity)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse a checkpoint of another part or network."""
+        check_identity(checkpoint, self._identity)
+
+    def _losses(self, batch: Batch) -> dict[str, Tensor]:
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16):
+            predicted = self.network(batch.points)
+        return self.loss(predicted, batch)
+
+    def _log(self, stage: str, losses: dict[str, Tensor], size: int) -> None:
+        for name, value in losses.items():
+            group = f"{stage}/loss" if name == "loss" else f"{stage}_loss/{name}"
+            self.log(group, value, prog_bar=name == "loss", batch_size=size)
+
+
+def check_identity(checkpoint: dict[str, Any], expected: dict[str, str]) -> None:
+    """Raise ValueError where a checkpoint belongs to something else; says to what."""
+    found = checkpoint.get("pnet")
+    if not isinstance(found, dict):
+        raise ValueError("the checkpoint was not written by pnet")
+    for key, value in expected.items():
+        if found.get(key) != value:
+            raise ValueError(
+                f"the checkpoint's {key} is {found.get(key)!r}, this configuration's is {value!r}; "
+                "use the configuration that it was trained with, or another run_dir"
+            )
