@@ -123,6 +123,9 @@ class ParametricPart(ABC):
             raise ValueError(
                 f"part.{key} names {sorted(values)}, {self.name} has {sorted(self.parameter_names)}"
             )
+        for name, column in values.items():
+            if isinstance(column, (str, int, float)) or not len(column):
+                raise ValueError(f"part.{key}.{name} is {column!r}, expected a list of values in mm")
         axes = [values[name] for name in reversed(self.parameter_names)]
         grid = np.array([combination[::-1] for combination in product(*axes)], float) / 1000
         for parameters in grid:

@@ -7,6 +7,7 @@ reference to a primitive, where the next keypoint lies; a found keypoint may be 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from math import isfinite
 
 import torch
 from torch import Tensor
@@ -38,7 +39,7 @@ class KeypointChoice:
     direction: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        if len(self.direction) != 3 or not any(self.direction):
+        if len(self.direction) != 3 or not any(self.direction) or not all(map(isfinite, self.direction)):
             raise ValueError(f"targets.direction is {self.direction}, expected three numbers, not all zero")
 
     @property

@@ -160,6 +160,9 @@ def _in_parallel(
         pool.shutdown(wait=not running, cancel_futures=True)
         for process in processes if running else []:
             process.terminate()
+            process.join()
+            for left_over in root.rglob(f".*.{process.pid}{TEMPORARY}"):
+                left_over.unlink(missing_ok=True)
 
 
 def _start_worker(factory: SceneFactory, root: Path) -> None:

@@ -92,7 +92,14 @@ class Protocol:
         found = []
         for split in sorted(self.splits, key=lambda s: s == "train"):
             plan = self.splits[split]
-            objects = range(grid_sizes[plan.grid]) if plan.objects is None else plan.objects
+            size = grid_sizes[plan.grid]
+            objects = range(size) if plan.objects is None else plan.objects
+            outside = [index for index in objects if not 0 <= index < size]
+            if outside:
+                raise ValueError(
+                    f"protocol {self.name}, split {split}: part object {outside[0]} is not in grid "
+                    f"{plan.grid}, which has 0 to {size - 1}"
+                )
             for kind, count in (("pile", plan.cycles), ("clutter", plan.clutter_cycles)):
                 cycles = range(plan.first_cycle, plan.first_cycle + count)
                 found += [

@@ -115,8 +115,7 @@ class CycleFile:
             )
 
     def _read_header(self, content: dict[str, Any]) -> None:
-        own = _header_checksum(content)
-        if content.get("header_crc32", own) != own:  # the first files had none
+        if content["header_crc32"] != _header_checksum(content):
             raise ValueError("the header does not match its checksum")
         self._crc32 = content["crc32"]
         fields = {key: content[key] for key in CycleHeader.__dataclass_fields__}
