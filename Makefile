@@ -25,7 +25,7 @@ $(STAMP): pyproject.toml constraints.txt
 
 demo: $(STAMP)  ## Generate scenes of TN34, train, evaluate and write the report (outputs/demo)
 	$(call run,pnet-generate part=tn34 protocol=demo)
-	$(call run,pnet-train part=tn34 protocol=demo run_dir=$(DEMO_RUN))
+	$(call run,pnet-train part=tn34 protocol=demo run_dir=$(DEMO_RUN) ckpt=auto)
 	$(call run,pnet-evaluate run=$(DEMO_RUN))
 	$(call run,pnet-report run=$(DEMO_RUN))
 

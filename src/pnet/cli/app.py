@@ -14,9 +14,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 Task = Callable[[DictConfig], None]
+# what a user can mend; anything else is a fault of ours and keeps its traceback
+EXPECTED = (ValueError, OSError, ModuleNotFoundError, HydraException, OmegaConfBaseException)
 TRACEBACK = "PNET_TRACEBACK"  # set it to 1 to see where an error comes from
 
 
@@ -42,37 +44,40 @@ def run_app(task: Task, config_name: str) -> None:
     try:
         folder = config_dir()
         _explain_bad_overrides(folder, config_name, sys.argv[1:])
-    except (HydraException, OmegaConfBaseException, OSError, ValueError) as fault:
+        decorate = hydra.main(version_base="1.3", config_path=str(folder), config_name=config_name)
+        decorate(_guarded(task))()
+    except KeyboardInterrupt:
+        print("interrupted: the same command goes on (pnet-train with ckpt=last)", file=sys.stderr)
+        sys.exit(130)
+    except EXPECTED as fault:
         fail(fault)
-    decorate = hydra.main(version_base="1.3", config_path=str(folder), config_name=config_name)
-    decorate(_guarded(task))()
 
 
 def fail(fault: BaseException) -> NoReturn:
     """Print one clear line and leave with exit code 1."""
     if os.environ.get(TRACEBACK) == "1":
         raise fault
-    text = " ".join(str(fault).split()) or type(fault).__name__
-    if isinstance(fault, OSError) and fault.filename and not str(fault).startswith(str(fault.filename)):
-        text = f"{fault.filename}: {fault.strerror}"
-    print(f"error: {text}", file=sys.stderr)
+    print(f"error: {error_text(fault)}", file=sys.stderr)
     sys.exit(1)
 
 
+def error_text(fault: BaseException) -> str:
+    """What to tell the user, on one line."""
+    if isinstance(fault, MissingMandatoryValue):
+        return f"{fault.full_key} is missing: give {fault.full_key}=…; --help says what it is"
+    text = " ".join(str(fault).split()) or type(fault).__name__
+    if isinstance(fault, OSError) and fault.filename and fault.strerror:
+        return f"{fault.filename}: {fault.strerror}"
+    return text
+
+
 def _guarded(task: Task) -> Task:
+    """The task with its errors told here: Hydra would print a traceback."""
+
     def guarded(cfg: DictConfig) -> None:
         try:
             task(cfg)
-        except KeyboardInterrupt:
-            print("interrupted: the same command goes on where this one stopped", file=sys.stderr)
-            sys.exit(130)
-        except (
-            ValueError,
-            OSError,
-            ModuleNotFoundError,
-            HydraException,
-            OmegaConfBaseException,
-        ) as fault:
+        except EXPECTED as fault:
             fail(fault)
 
     return guarded

@@ -1,5 +1,6 @@
 """pnet-evaluate: predict a split to a file, then score the file."""
 
+from collections.abc import Iterator
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,8 +42,17 @@ def evaluate(cfg: DictConfig) -> None:
 
 def evaluation_folder(cfg: DictConfig, run: Path) -> Path:
     """Where the files of this evaluation lie: named by what differs from the plain one."""
-    changed = "_".join(f"{key}-{value}" for key, value in cfg.postprocess.items())
-    return run / "evaluation" / "_".join(word for word in (cfg.split, changed) if word)
+    changed = [f"{key}-{value}" for key, value in _leaves(OmegaConf.to_container(cfg.postprocess))]
+    every = [f"every-{cfg.every}"] if cfg.every > 1 else []
+    return run / "evaluation" / "_".join([cfg.split, *every, *changed]).replace("/", "-")
+
+
+def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(node, dict):
+        for key, child in node.items():
+            yield from _leaves(child, f"{path}.{key}" if path else str(key))
+    else:
+        yield path, node
 
 
 def open_scenes(cfg: DictConfig, trained: DictConfig) -> tuple["SceneFolder", str]:

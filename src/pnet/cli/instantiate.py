@@ -40,7 +40,7 @@ def _check(key: str, target: str) -> None:
     except Exception as fault:
         raise ValueError(f"{where} does not exist ({fault})") from fault
     # a name that is only imported there may be anything: judge the object by where it was defined
-    home = f"{found.__module__}.{found.__qualname__}"
+    home = f"{getattr(found, '__module__', '')}.{getattr(found, '__qualname__', '')}"
     if not (isinstance(found, type) or callable(found)) or not home.startswith(ALLOWED):
         raise ValueError(f"{where} is {home}, which is not allowed")
 

@@ -24,19 +24,23 @@ def train(cfg: DictConfig) -> None:
     import lightning
     import torch
 
+    quiet_lightning()
     from pnet.cli.build import CONFIG, RESOLVED, build_data, build_parts, identity, use_bf16
     from pnet.cli.instantiate import instantiate
     from pnet.engine.callbacks import PoseValidation, Throughput
-    from pnet.engine.checkpoints import NAME, ResumableCheckpoint
+    from pnet.engine.checkpoints import NAME, ResumableCheckpoint, read_checkpoint
     from pnet.engine.estimator import NetworkEstimator
-    from pnet.engine.provenance import provenance, write_json
-    from pnet.engine.training import PoseTraining
+    from pnet.engine.provenance import provenance, read_json, write_json
+    from pnet.engine.training import PoseTraining, check_identity
     from pnet.scenes.store import write_atomically
 
     if cfg.trainer.threads is not None:
         torch.set_num_threads(cfg.trainer.threads)
     run = Path(cfg.run_dir)
     checkpoint = resume_from(cfg.ckpt, run / "checkpoints" / NAME)
+    if checkpoint is not None and is_finished(run, cfg.trainer.steps):
+        print_end(run, read_json(run / "metrics.json"))
+        return
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
     parts, bf16 = build_parts(cfg), use_bf16(cfg.trainer.precision)
     data = build_data(cfg, parts.part)
@@ -51,6 +55,8 @@ def train(cfg: DictConfig) -> None:
         bf16,
         identity(cfg),
     )
+    if checkpoint is not None:  # before the settings of the run are replaced
+        check_identity(read_checkpoint(checkpoint), identity(cfg))
     run.mkdir(parents=True, exist_ok=True)
     write_atomically(run / CONFIG, OmegaConf.to_yaml(cfg).encode())
     write_atomically(run / RESOLVED, OmegaConf.to_yaml(cfg, resolve=True).encode())
@@ -64,17 +70,35 @@ def train(cfg: DictConfig) -> None:
         ResumableCheckpoint(run / "checkpoints"),
     ]
     trainer = build_trainer(cfg, run, callbacks)
-    trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
-    if trainer.interrupted:
-        raise KeyboardInterrupt
+    try:
+        trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    except SystemExit:  # what Lightning makes of Ctrl-C
+        raise KeyboardInterrupt from None
     metrics = final_metrics(trainer, throughput)
     log_settings(trainer, cfg, metrics)
     write_json(run / "metrics.json", metrics)
     print_end(run, metrics)
 
 
+def quiet_lightning() -> None:
+    """Keep Lightning's advertisements and notes on its own internals off the screen."""
+    import logging
+    import warnings
+
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", module="lightning.*")
+
+
 def resume_from(ckpt: str | None, last: Path) -> Path | None:
-    """The checkpoint to go on from, or None to begin; a begun run is not overwritten by mistake."""
+    """The checkpoint to go on from, or None to begin; a begun run is not overwritten by mistake.
+
+    Args:
+        ckpt: None begins, "last" goes on, "auto" does what fits, anything else is a checkpoint's path.
+        last: the run's own checkpoint.
+    """
+    if ckpt == "auto":
+        ckpt = "last" if last.exists() else None
     if ckpt is None:
         if last.exists():
             raise ValueError(
@@ -91,6 +115,14 @@ def resume_from(ckpt: str | None, last: Path) -> Path | None:
     return path
 
 
+def is_finished(run: Path, steps: int) -> bool:
+    """Whether a run's training has ended after at least so many steps."""
+    from pnet.engine.provenance import read_json
+
+    path = run / "metrics.json"
+    return path.is_file() and int(read_json(path).get("steps") or 0) >= steps
+
+
 def build_trainer(cfg: DictConfig, run: Path, callbacks: list["lightning.Callback"]) -> "lightning.Trainer":
     """The Lightning trainer: an epoch lasts from one checkpoint to the next."""
     import lightning
@@ -103,10 +135,16 @@ def build_trainer(cfg: DictConfig, run: Path, callbacks: list["lightning.Callbac
             f"trainer.validate_every ({options.validate_every}) must be a multiple of "
             f"trainer.checkpoint_every ({options.checkpoint_every})"
         )
+    if options.steps % options.checkpoint_every:
+        raise ValueError(
+            f"trainer.steps ({options.steps}) must be a multiple of trainer.checkpoint_every "
+            f"({options.checkpoint_every})"
+        )
     return lightning.Trainer(
         accelerator=options.accelerator,
         devices=options.devices,
-        max_steps=options.steps,
+        # counted in epochs: with max_steps Lightning skips an epoch when it resumes at an epoch's end
+        max_epochs=options.steps // options.checkpoint_every,
         check_val_every_n_epoch=options.validate_every // options.checkpoint_every,
         gradient_clip_val=options.clip,
         logger=TensorBoardLogger(run, name="tensorboard", version="", default_hp_metric=False),

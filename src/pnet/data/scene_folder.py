@@ -33,7 +33,7 @@ class SceneFolder(Sequence[Scene]):
                     f"{file.path}: shows {file.header.part}, not {part}; set part={file.header.part} "
                     "or another data.root"
                 )
-        self.points_per_scene = min(file.points_per_scene for file in files if len(file))
+        self.points_per_scene = min((file.points_per_scene for file in files if len(file)), default=0)
         chosen = [list(range(len(file)))[::-1][::every][::-1] for file in files]
         self._index = chosen
         self._ends = list(accumulate(len(indices) for indices in chosen))

@@ -59,9 +59,9 @@ def read_predictions(path: Path) -> tuple[PredictionHeader, list[Detections]]:
         with safe_open(path, framework="pt") as file:
             content: dict[str, Any] = json.loads((file.metadata() or {})[FORMAT])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        header = PredictionHeader(**{key: content[key] for key in PredictionHeader.__dataclass_fields__})
-        if content["version"] > VERSION:
+        if content["version"] > VERSION:  # before its fields, which may be others
             raise ValueError(f"{path}: written by a newer pnet; update pnet or predict again")
+        header = PredictionHeader(**{key: content[key] for key in PredictionHeader.__dataclass_fields__})
         return header, _split(tensors)
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no predictions there; run pnet-evaluate first") from None

@@ -41,9 +41,10 @@ class RadiusFilter:
         radius = self.radius
         while True:
             kept = (distance <= radius).sum(1) - 1 >= self.neighbours
-            if float(kept.float().mean()) >= self.enough:
+            if float(kept.double().mean()) >= self.enough:
                 return kept
             radius += self.widen
-            if radius > self.max_radius or self.widen <= 0:
+            # a nanometre of slack: 0.01 + 5 · 0.002 is a little more than 0.02 in floating point
+            if radius > self.max_radius + 1e-9 or self.widen <= 0:
                 # nothing is dense enough: better all votes than an instance without any
                 return kept if bool(kept.any()) else torch.ones_like(kept)
