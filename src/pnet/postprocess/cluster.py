@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 
 import torch
-from sklearn.cluster import MeanShift
 from torch import Tensor
+
+from pnet.postprocess.mean_shift import mean_shift
 
 
 @dataclass(frozen=True)
@@ -31,17 +32,8 @@ class CentroidClusters:
         """
         if len(centroids) == 0 or not bool(torch.isfinite(centroids).all()):
             return torch.full((len(centroids),), -1)
-        shift = MeanShift(
-            bandwidth=self.bandwidth,
-            bin_seeding=True,
-            min_bin_freq=self.min_seed_points,
-            cluster_all=False,
-        )
-        try:
-            labels = shift.fit(centroids.double().cpu().numpy()).labels_
-        except ValueError:  # no seed: nothing is dense enough to be an instance
-            return torch.full((len(centroids),), -1)
-        return drop_small(torch.from_numpy(labels).long(), self.min_points)
+        _, labels = mean_shift(centroids.double(), self.bandwidth, self.min_seed_points)
+        return drop_small(labels, self.min_points)
 
 
 def drop_small(labels: Tensor, min_points: int) -> Tensor:
