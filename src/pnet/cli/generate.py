@@ -29,10 +29,10 @@ def generate_data(cfg: DictConfig) -> None:
 
     settings = making_settings(cfg)
     factory = build_factory(cfg, settings)
+    grid_sizes = {name: len(grid) for name, grid in factory.part.grids.items()}
+    tasks = factory.protocol.tasks(grid_sizes)  # may refuse the settings, so before anything is written
     root = Path(cfg.data.root)
     open_root(root, settings)
-    grid_sizes = {name: len(grid) for name, grid in factory.part.grids.items()}
-    tasks = factory.protocol.tasks(grid_sizes)
     workers = os.cpu_count() or 1 if cfg.workers is None else cfg.workers
     summary, start = Summary(), perf_counter()
     with scene_progress(len(tasks), len(factory.protocol.scene_drops())) as advance:

@@ -10,8 +10,11 @@ from omegaconf import DictConfig, OmegaConf
 ALLOWED = (
     "pnet.geometry.camera.",
     "pnet.parts.",
-    "pnet.scenes.",
-    "pnet.data.",
+    "pnet.scenes.pile.",
+    "pnet.scenes.piling.",
+    "pnet.scenes.protocol.",
+    "pnet.data.augmentation.",
+    "pnet.data.module.",
     "pnet.backbones.",
     "pnet.models.",
     "pnet.postprocess.",
@@ -39,9 +42,10 @@ def _check(key: str, target: str) -> None:
         found = get_object(target)
     except Exception as fault:
         raise ValueError(f"{where} does not exist ({fault})") from fault
-    # a name that is only imported there may be anything: judge the object by where it was defined
+    # a name that is only imported there may be anything: judge the object by where it was defined;
+    # classes only: their constructors hold values, a function could act
     home = f"{getattr(found, '__module__', '')}.{getattr(found, '__qualname__', '')}"
-    if not (isinstance(found, type) or callable(found)) or not home.startswith(ALLOWED):
+    if not isinstance(found, type) or not home.startswith(ALLOWED):
         raise ValueError(f"{where} is {home}, which is not allowed")
 
 

@@ -55,13 +55,6 @@ def train(cfg: DictConfig) -> None:
         bf16,
         identity(cfg),
     )
-    if checkpoint is not None:  # before the settings of the run are replaced
-        check_identity(read_checkpoint(checkpoint), identity(cfg))
-    run.mkdir(parents=True, exist_ok=True)
-    write_atomically(run / CONFIG, OmegaConf.to_yaml(cfg).encode())
-    write_atomically(run / RESOLVED, OmegaConf.to_yaml(cfg, resolve=True).encode())
-    write_json(run / "provenance.json", provenance(cfg.seed))
-    (run / "metrics.json").unlink(missing_ok=True)
     throughput = Throughput()
     estimator = NetworkEstimator(parts.part, parts.network, parts.recovery, bf16)
     callbacks = [
@@ -70,6 +63,13 @@ def train(cfg: DictConfig) -> None:
         ResumableCheckpoint(run / "checkpoints"),
     ]
     trainer = build_trainer(cfg, run, callbacks)
+    if checkpoint is not None:  # before the settings of the run are replaced
+        check_identity(read_checkpoint(checkpoint), identity(cfg))
+    run.mkdir(parents=True, exist_ok=True)
+    write_atomically(run / CONFIG, OmegaConf.to_yaml(cfg).encode())
+    write_atomically(run / RESOLVED, OmegaConf.to_yaml(cfg, resolve=True).encode())
+    write_json(run / "provenance.json", provenance(cfg.seed))
+    (run / "metrics.json").unlink(missing_ok=True)
     try:
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     except SystemExit:  # what Lightning makes of Ctrl-C
