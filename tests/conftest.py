@@ -1,18 +1,24 @@
 """What several rooms' tests share: the two templates as the configs have them, a tiny data set's maker."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 from omegaconf import OmegaConf
+from scipy.spatial.transform import Rotation
 
 from pnet.cli.instantiate import instantiate
 from pnet.geometry.camera import Camera
 from pnet.parts.base import ParametricPart
+from pnet.records import Scene, SceneId
 from pnet.scenes.factory import SceneFactory
 from pnet.scenes.pile import Bin
 from pnet.scenes.piling import Physics
 from pnet.scenes.protocol import Protocol, SplitPlan
+from pnet.scenes.store import CycleHeader, write_cycle
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -76,3 +82,55 @@ def factory(tn34: ParametricPart, camera: Camera, box: Bin) -> SceneFactory:
         seed=0,
         fingerprint="tiny",
     )
+
+
+@pytest.fixture(scope="session")
+def make_scene(camera: Camera) -> Callable[..., Scene]:
+    """Makes a scene without physics: bodies 50 mm apart in random orientations, points in random order."""
+
+    def make(part: ParametricPart, bodies: int = 4, points: int = 400, seed: int = 0) -> Scene:
+        rng = np.random.default_rng(seed)
+        size = part.part_object("L", seed % len(part.grids["L"]))
+        R = Rotation.random(bodies, rng).as_matrix()
+        column, row = np.arange(bodies) % 3, np.arange(bodies) // 3
+        t = np.stack([0.05 * (column - 1), 0.05 * (row - 1), 0.6 + 0.002 * np.arange(bodies)], -1)
+        instance = rng.permutation(np.arange(points) % bodies)
+        surface = part.mesh(size).sample(points, seed=seed)
+        cloud = np.einsum("nij,nj->ni", R[instance], surface) + t[instance]
+        return Scene(
+            points=cloud.astype(np.float32),
+            instance=instance,
+            R=R,
+            t=t,
+            parameters=np.tile(size, (bodies, 1)),
+            visibility=0.5 + 0.5 * rng.random(bodies),
+            occlusion=0.4 * rng.random(bodies),
+            camera=camera,
+            part=part.name,
+            id=SceneId("train", "pile", 0, 0, bodies),
+        )
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def write_split(make_scene: Callable[..., Scene]) -> Callable[..., list[Scene]]:
+    """Writes a split of such scenes, one more body in each, and returns them in the order of reading."""
+
+    def write(
+        root: Path, part: ParametricPart, split: str, cycles: int = 2, scenes: int = 3, points: int = 256
+    ) -> list[Scene]:
+        (root / split).mkdir(parents=True)
+        written: list[Scene] = []
+        for cycle in range(cycles):
+            drops = tuple(range(1, scenes + 1))
+            made = [
+                replace(make_scene(part, drop, points, 10 * cycle), id=SceneId(split, "pile", cycle, 0, drop))
+                for drop in drops
+            ]
+            header = CycleHeader("tiny", part.name, made[0].camera, split, "pile", cycle, 0, drops)
+            write_cycle(root / split / f"pile_{cycle:04d}_part_00.safetensors", header, made)
+            written += made
+        return written
+
+    return write

@@ -14,6 +14,7 @@ from torch.nn import functional as F
 from pnet.backbones.base import Backbone, Tables
 from pnet.backbones.layers import conv_block, gather_rows, shared_mlp
 
+MAX_CELLS = 1024  # a side; points farther out share the cells of the border
 CELL_FEATURES = 4  # where in the cell the points lie (2), their depth, whether there are any
 
 
@@ -62,6 +63,8 @@ class RangeUNet(Backbone):
     def tables(self, points: Tensor) -> Tables:
         """Cell of every point and its place within; the grid is as large as the widest cloud needs.
 
+        So clouds of a batch share a grid, and a cloud's features may differ a little with its company.
+
         Returns:
             cell (B, N) int64, local (B, N, 3): offset from the cell's middle in cells and depth from the
             cloud's mean in units of depth_scale; size (2,) int64 rows and columns.
@@ -70,7 +73,7 @@ class RangeUNet(Backbone):
             direction = points[..., :2] / points[..., 2:] / self._angle
             low = direction.amin(1, keepdim=True)
             extent = (direction.amax(1) - low[:, 0]).amax(0)
-            cells = extent.floor().long() + 1
+            cells = extent.clamp(max=MAX_CELLS - 1).floor().long() + 1
             size = (cells + self._multiple - 1) // self._multiple * self._multiple
             # the cloud in the middle of the grid
             own = direction.amax(1, keepdim=True) - low

@@ -80,7 +80,7 @@ class SceneDataModule(lightning.LightningDataModule):
         if (self._draws or len(scenes)) < self._batch_size:
             raise ValueError(
                 f"data.batch_size is {self._batch_size}, but an epoch has only "
-                f"{self._draws or len(scenes)} scenes; lower it or raise data.draws"
+                f"{self._draws or len(scenes)} scenes; lower it or make more scenes"
             )
         sampler = EpochSampler(len(scenes), self._seed, self._draws)
         return self._loader(dataset, sampler, drop_last=True)

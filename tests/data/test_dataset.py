@@ -1,0 +1,96 @@
+"""Labelled scenes are pure functions; the order of training is fair."""
+
+from collections import Counter
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pnet.data.augmentation import Augmentation
+from pnet.data.dataset import EpochSampler, LabelledScenes, collate, first_points
+from pnet.data.scene_folder import SceneFolder
+from pnet.data.targets import point_labels
+from pnet.parts.keypoints import KeypointChoice
+
+CHOICE = KeypointChoice()
+
+
+def epoch(sampler: EpochSampler, number: int) -> list[int]:
+    sampler.set_epoch(number)
+    draws = list(sampler)
+    assert {e for _, e in draws} <= {number}
+    return [index for index, _ in draws]
+
+
+@given(size=st.integers(1, 12), draws=st.integers(1, 30), seed=st.integers(0, 5))
+def test_epochs_cut_an_endless_row_of_permutations(size, draws, seed):
+    sampler = EpochSampler(size, seed, draws)
+    row = [index for number in range(6) for index in epoch(sampler, number)]
+    assert len(row) == 6 * draws and len(sampler) == draws
+    for start in range(0, len(row) - size + 1, size):
+        assert sorted(row[start : start + size]) == list(range(size))
+    counts = Counter(row)
+    assert max(counts.values()) - min(counts[i] for i in range(size)) <= 1
+
+
+def test_an_epoch_is_a_pure_function_of_seed_and_number():
+    first, again = EpochSampler(50, 3, 20), EpochSampler(50, 3, 20)
+    epoch(first, 0)
+    epoch(first, 1)
+    assert epoch(first, 7) == epoch(again, 7)
+    assert epoch(again, 7) != epoch(again, 8)
+    assert epoch(EpochSampler(50, 4, 20), 7) != epoch(again, 7)
+
+
+def test_without_draws_each_scene_comes_once():
+    sampler = EpochSampler(9, 0)
+    assert sorted(epoch(sampler, 4)) == list(range(9)) and len(sampler) == 9
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, tn34, write_split):
+    root = tmp_path_factory.mktemp("data")
+    write_split(root, tn34, "train")
+    return SceneFolder(root, "train", "tn34")
+
+
+def test_an_item_depends_on_seed_epoch_and_index_only(folder, tn34):
+    def dataset(seed):
+        return LabelledScenes(folder, tn34.chain, CHOICE, 64, Augmentation(True, 0.001), seed)
+
+    first, again = dataset(1), dataset(1)
+    for draw in [(0, 0), (5, 3), (2, 3)]:
+        first[draw]  # reading in between must not matter
+    item, same = first[(4, 2)], again[(4, 2)]
+    assert all(torch.equal(item[name], same[name]) for name in item)
+    for other in (again[(4, 3)], again[(3, 2)], dataset(2)[(4, 2)]):
+        assert not torch.equal(item["points"], other["points"])
+
+
+def test_without_augmentation_items_are_the_stored_scenes(folder, tn34):
+    dataset = LabelledScenes(folder, tn34.chain, CHOICE)
+    expected = point_labels(folder[3], tn34.chain, CHOICE)
+    assert len(dataset) == 6 and int(dataset[3]["scene"]) == 3
+    for draw in (3, (3, 9)):
+        assert all(torch.equal(dataset[draw][name], value) for name, value in expected.items())
+
+
+def test_points_are_a_prefix(folder, tn34):
+    item = LabelledScenes(folder, tn34.chain, CHOICE, points=10)[2]
+    assert torch.equal(item["points"], torch.from_numpy(folder[2].points[:10]))
+    assert item["keypoints"].shape == (10, 3, 3)
+    assert first_points(folder[2], None).points.shape == (256, 3)
+
+
+def test_more_points_than_stored_are_refused(folder, tn34):
+    with pytest.raises(ValueError, match=r"data\.points is 257, the stored scenes have 256"):
+        LabelledScenes(folder, tn34.chain, CHOICE, points=257)
+
+
+def test_collate_stacks(folder, tn34):
+    dataset = LabelledScenes(folder, tn34.chain, CHOICE, points=10)
+    batch = collate([dataset[1], dataset[4]])
+    assert batch.points.shape == (2, 10, 3) and batch.keypoints.shape == (2, 10, 3, 3)
+    assert batch.scene.tolist() == [1, 4]
+    assert torch.equal(batch.centroid[1], dataset[4]["centroid"])

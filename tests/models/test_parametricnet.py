@@ -1,0 +1,55 @@
+"""The whole network on a small backbone."""
+
+import pytest
+import torch
+
+from pnet.backbones.pointnet2 import Level, PointNet2
+from pnet.models.parametricnet import ParametricNet
+
+
+def build(visibility: bool = True, scale: float = 0.02) -> ParametricNet:
+    torch.manual_seed(0)
+    backbone = PointNet2([Level(16, 0.05, 8, [8])], [[12]])
+    return ParametricNet(backbone, 3, [8], [8], scale, visibility)
+
+
+@pytest.fixture
+def points() -> torch.Tensor:
+    return 0.1 * torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(0))
+
+
+def test_shapes(points):
+    found = build()(points)
+    assert found.centroid.shape == (2, 40, 3)
+    assert found.keypoints.shape == (2, 40, 3, 3)
+    assert found.visibility.shape == (2, 40)
+
+
+def test_without_the_visibility_module(points):
+    net = build(visibility=False)
+    assert net(points).visibility is None
+    assert not [name for name in net.state_dict() if name.startswith("visibility")]
+
+
+def test_tables_may_be_found_beforehand(points):
+    net = build().eval()
+    given, own = net(points, net.backbone.tables(points)), net(points)
+    assert torch.equal(given.keypoints, own.keypoints)
+
+
+def test_with_scale_zero_every_point_predicts_itself(points):
+    found = build(scale=0.0)(points)
+    assert torch.equal(found.centroid, points)
+    assert torch.equal(found.keypoints, points[:, :, None].expand(-1, -1, 3, -1))
+
+
+def test_the_gradient_reaches_every_weight(points):
+    net = build()
+    found = net(points)
+    (found.centroid.square().sum() + found.keypoints.square().sum() + found.visibility.sum()).backward()
+    assert not [name for name, p in net.named_parameters() if p.grad is None or not bool(p.grad.any())]
+
+
+def test_a_cloud_smaller_than_the_finest_level_is_refused(points):
+    with pytest.raises(ValueError, match="at least 16 points, got 15"):
+        build()(points[:, :15])
