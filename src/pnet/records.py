@@ -82,6 +82,10 @@ class Batch:
     visibility: Tensor
     scene: Tensor
 
+    def pin_memory(self) -> "Batch":
+        """A copy in page-locked memory, for asynchronous transfer; the loader calls it."""
+        return Batch(**{name: value.pin_memory() for name, value in vars(self).items()})
+
 
 @dataclass(frozen=True, eq=False)
 class PointPrediction:

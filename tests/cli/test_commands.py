@@ -223,6 +223,54 @@ def test_going_on_with_another_backbone_is_refused_and_leaves_the_run_as_it_is(s
     assert snapshot(smoke_copy.run) == before
 
 
+def test_a_finished_run_is_left_alone_and_other_settings_are_named(smoke_copy, run_here):
+    before = snapshot(smoke_copy.run)
+    again = run_here(smoke_copy.folder, "train", *TRAIN, "run_dir=outputs/run", "ckpt=auto")
+    assert again.code == 0 and "4 steps" in again.out
+    other = run_here(smoke_copy.folder, "train", *TRAIN, "run_dir=outputs/run", "ckpt=auto", "seed=1")
+    assert "holds a training with other settings: seed was 0, now 1" in other.error
+    assert snapshot(smoke_copy.run) == before
+
+
+def test_going_on_with_other_labels_or_data_is_refused(smoke_copy, run_here):
+    going_on = ("train", *TRAIN, "run_dir=outputs/run", "ckpt=last", "trainer.steps=8")
+    labels = run_here(smoke_copy.folder, *going_on, "data.targets.geometric_unique=false")
+    assert "the checkpoint's targets is" in labels.error
+    manifest = smoke_copy.data / "dataset.json"
+    manifest.write_text(manifest.read_text().replace('"seed": 0', '"seed": 1'))
+    assert "the checkpoint's data is" in run_here(smoke_copy.folder, *going_on).error
+
+
+def test_a_run_killed_before_its_metrics_gets_them_when_it_goes_on(smoke_copy, run_here):
+    metrics = smoke_copy.run / "metrics.json"
+    before = json.loads(metrics.read_text())["validation"]
+    metrics.unlink()
+    outcome = run_here(smoke_copy.folder, "train", *TRAIN, "run_dir=outputs/run", "ckpt=last")
+    assert outcome.code == 0
+    after = json.loads(metrics.read_text())["validation"]
+    assert after["loss"] == pytest.approx(before["loss"], rel=1e-6) and after["AP"] == before["AP"]
+
+
+def test_half_generated_data_is_refused(smoke_copy, run_here):
+    (smoke_copy.data / "train" / "pile_0000_part_05.safetensors").unlink()
+    error = run_here(smoke_copy.folder, "train", *TRAIN, "run_dir=outputs/new").error
+    assert "train: only 3 of 4 cycles are there; run pnet-generate again" in error
+    assert not (smoke_copy.folder / "outputs" / "new").exists()
+
+
+def test_the_first_step_alone_writes_predictions_only(smoke_copy, run_here):
+    arguments = ("run=outputs/run", "split=test_g", "stage=predict", "threads=1")
+    assert run_here(smoke_copy.folder, "evaluate", *arguments).code == 0
+    folder = smoke_copy.run / "evaluation" / "test_g"
+    assert [path.name for path in folder.iterdir()] == ["predictions.safetensors"]
+
+
+def test_a_misspelt_post_processing_key_is_answered_with_close_ones(smoke, run_here):
+    arguments = ("run=outputs/run", "+postprocess.trusty=0.1")
+    error = run_here(smoke.folder, "evaluate", *arguments).error
+    assert "postprocess.trusty: unknown key, did you mean trust" in error
+
+
 @pytest.mark.parametrize("content", [b"", b"garble", None])
 def test_a_damaged_checkpoint_is_named(smoke_copy, run_here, content):
     path = smoke_copy.run / "checkpoints" / "last.ckpt"

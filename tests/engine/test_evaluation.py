@@ -147,6 +147,28 @@ def test_an_empty_cloud_holds_nothing(estimator):
     assert [len(d.score) for d in found] == [0, 0]
 
 
+@pytest.mark.parametrize("depth", [0.0, -0.6])
+def test_points_at_or_behind_the_camera_are_refused(part, depth):
+    estimator = NetworkEstimator(part, torch.nn.Linear(1, 1), None)
+    cloud = torch.tensor([[[0.0, 0.0, 0.6], [0.0, 0.0, depth]]])
+    with pytest.raises(ValueError, match="at or behind the camera"):
+        estimator.estimate(cloud)
+
+
+def test_a_scene_without_bodies_counts_every_result_as_false(tn34, make_scene):
+    scene = make_scene(tn34, bodies=2)
+    empty = replace(
+        scene,
+        R=scene.R[:0],
+        t=scene.t[:0],
+        parameters=scene.parameters[:0],
+        visibility=scene.visibility[:0],
+        occlusion=scene.occlusion[:0],
+    )
+    values = SceneScorer(tn34).add_all([empty], [perfect(scene)]).compute()
+    assert values["AP"] == 0 and values["false_positives"] == 2 and values["truths_to_find"] == 0
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_points_that_are_no_numbers_are_refused(estimator, make_scene, tn34, value):
     cloud = torch.from_numpy(make_scene(tn34).points.copy())[None]

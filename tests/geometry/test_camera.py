@@ -50,3 +50,9 @@ def test_a_camera_comes_back_from_its_plain_numbers():
 def test_an_impossible_camera_is_refused(wrong):
     with pytest.raises(ValueError, match="camera"):
         Camera(**CAMERA.to_dict() | wrong)
+
+
+def test_negative_depth_is_refused():
+    camera = Camera(width=2, height=1, fx=1.0, fy=1.0, cx=0.0, cy=0.0)
+    with pytest.raises(ValueError, match=r"negative values \(lowest -0.5 m\)"):
+        camera.depth_to_points(np.array([[0.4, -0.5]]))

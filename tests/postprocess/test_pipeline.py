@@ -128,6 +128,14 @@ def test_the_visibility_threshold_leaves_out_the_hidden(tn34, make_scene):
     assert set(found.instance[owner == 3].tolist()) == {1}
 
 
+def test_without_visibility_nothing_is_left_out_for_it(tn34, make_scene):
+    scene = make_scene(tn34, bodies=3, points=700)
+    few = torch.from_numpy(scene.instance != 2) | (torch.arange(700) % 7 == 0)
+    scene = replace(scene, points=scene.points[few.numpy()], instance=scene.instance[few.numpy()])
+    found = recover(tn34, scene, predict(scene, tn34, visibility=False), visibility_threshold=0.45)
+    assert len(found.score) == 3 and float(found.score.min()) < 0.2
+
+
 def test_scene_parameters_are_the_mean_of_the_best_visible(tn34, make_scene):
     scene = make_scene(tn34, bodies=3, points=300)
     sizes = scene.parameters * [[1.0], [1.2], [5.0]]

@@ -65,7 +65,10 @@ def error_text(fault: BaseException) -> str:
     """What to tell the user, on one line."""
     if isinstance(fault, MissingMandatoryValue):
         return f"{fault.full_key} is missing: give {fault.full_key}=…; --help says what it is"
-    text = " ".join(str(fault).split()) or type(fault).__name__
+    lines = str(fault).strip().splitlines() or [type(fault).__name__]
+    if lines[0].startswith("Caught "):  # a loader's worker sends its whole traceback: the end says it
+        lines = lines[-1:]
+    text = " ".join(" ".join(lines).split())
     if isinstance(fault, OSError) and fault.filename and fault.strerror:
         return f"{fault.filename}: {fault.strerror}"
     return text
@@ -97,6 +100,8 @@ def _explain_bad_overrides(folder: Path, config_name: str, arguments: list[str])
             if (override.key_or_group or "").startswith("hydra"):
                 continue
             trial = _first_choice(override)
+            if trial is None:
+                continue
             try:
                 compose(config_name, overrides=[*good, trial], return_hydra_config=True)
             except (HydraException, OmegaConfBaseException) as fault:
@@ -105,10 +110,13 @@ def _explain_bad_overrides(folder: Path, config_name: str, arguments: list[str])
     GlobalHydra.instance().clear()
 
 
-def _first_choice(override: Override) -> str:
+def _first_choice(override: Override) -> str | None:
+    """The override with the first value of its sweep; None where Hydra alone can list the values."""
     text = override.input_line or ""
     if not override.is_sweep_override():
         return text
+    if not override.is_discrete_sweep() or "glob(" in text:
+        return None
     first = next(iter(override.sweep_string_iterator()))
     return f"{text.split('=')[0]}={first}"
 
@@ -117,25 +125,27 @@ def _hint(folder: Path, config_name: str, override: Override, good: list[str], f
     key, value = override.key_or_group or "", str(override.value())
     choices = sorted(path.stem for path in (folder / key).glob("*.yaml")) if key else []
     if choices and value not in choices:
-        return f"{key}={value}: no such choice{_close(value, choices)}; there are {', '.join(choices)}"
+        return f"{key}={value}: no such choice{closest(value, choices)}; there are {', '.join(choices)}"
     cfg = compose(config_name, overrides=good)
     groups = [path.name for path in folder.iterdir() if path.is_dir()]
-    keys = [*_keys(OmegaConf.to_container(cfg)), *groups]
+    keys = [*key_paths(OmegaConf.to_container(cfg)), *groups]
     if key not in keys:
-        return f"{key}: unknown key{_close(key, keys)}; `{Path(sys.argv[0]).name} --cfg job` lists all keys"
+        return f"{key}: unknown key{closest(key, keys)}; `{Path(sys.argv[0]).name} --cfg job` lists all keys"
     return f"{override.input_line}: {str(fault).splitlines()[0]}"
 
 
-def _close(word: str, known: list[str]) -> str:
+def closest(word: str, known: list[str]) -> str:
+    """ ", did you mean …?" with the known words that are nearest, or nothing."""
     found = difflib.get_close_matches(word, known, n=3, cutoff=0.5)
     tail = word.rsplit(".", 1)[-1]
     found = found or [k for k in known if k.rsplit(".", 1)[-1] == tail][:3]
     return f", did you mean {' or '.join(found)}?" if found else ""
 
 
-def _keys(node: Any, path: str = "") -> Iterator[str]:
+def key_paths(node: Any, path: str = "") -> Iterator[str]:
+    """Every key of nested settings, dotted."""
     if path:
         yield path
     if isinstance(node, dict):
         for name, child in node.items():
-            yield from _keys(child, f"{path}.{name}" if path else str(name))
+            yield from key_paths(child, f"{path}.{name}" if path else str(name))

@@ -56,25 +56,31 @@ def build_data(cfg: DictConfig, part: ParametricPart) -> SceneDataModule:
 
 
 def identity(cfg: DictConfig) -> dict[str, str]:
-    """What weights belong to: part, network and data, as text that can be compared."""
-    return {
-        "part": str(cfg.part._target_).rsplit(".", 1)[-1].lower(),
-        "backbone": OmegaConf.to_yaml(cfg.backbone, resolve=True),
-        "model": OmegaConf.to_yaml(cfg.model, resolve=True),
-    }
+    """What weights belong to: part, network and labels, as text that can be compared."""
+    groups = {"backbone": cfg.backbone, "model": cfg.model, "targets": cfg.data.targets}
+    texts = {name: OmegaConf.to_yaml(node, resolve=True) for name, node in groups.items()}
+    return {"part": instantiate(cfg.part).name, "points": str(cfg.data.points), **texts}
 
 
-def use_bf16(precision: str) -> bool:
+def device_of(accelerator: str) -> str:
+    """ "cuda" or "cpu", by the setting trainer.accelerator and by what is there."""
+    return "cuda" if torch.cuda.is_available() and accelerator in ("auto", "gpu", "cuda") else "cpu"
+
+
+def use_bf16(precision: str, accelerator: str) -> bool:
     """Whether to run the network in bfloat16.
 
     Args:
-        precision: "32", "bf16" or "auto": bf16 on a GPU or where the processor multiplies it in hardware.
+        precision: "32", "bf16" or "auto": bf16 where the device multiplies it in hardware.
+        accelerator: trainer.accelerator.
     """
     if precision not in ("32", "bf16", "auto"):
         raise ValueError(f"trainer.precision is {precision!r}, choose 32, bf16 or auto")
     if precision != "auto":
         return precision == "bf16"
-    return torch.cuda.is_available() or bool(torch.cpu._is_avx512_bf16_supported())
+    if device_of(accelerator) == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return bool(torch.cpu._is_avx512_bf16_supported())
 
 
 def read_run(run: Path) -> DictConfig:
@@ -116,7 +122,6 @@ def load_estimator(run: Path) -> tuple[DictConfig, "NetworkEstimator"]:
         parts.network.load_state_dict(weights)
     except (RuntimeError, ValueError, OmegaConfBaseException) as fault:
         raise ValueError(f"{checkpoint}: {fault}") from fault
-    device = "cuda" if torch.cuda.is_available() and cfg.trainer.accelerator != "cpu" else "cpu"
-    network = parts.network.to(device).eval()
-    bf16 = use_bf16(cfg.trainer.precision)
+    network = parts.network.to(device_of(cfg.trainer.accelerator)).eval()
+    bf16 = use_bf16(cfg.trainer.precision, cfg.trainer.accelerator)
     return cfg, NetworkEstimator(parts.part, network, parts.recovery, bf16)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from pnet.cli.app import run_app
+from pnet.cli.app import closest, key_paths, run_app
 
 if TYPE_CHECKING:
     from pnet.data.scene_folder import SceneFolder
@@ -37,14 +37,16 @@ def evaluate(cfg: DictConfig) -> None:
     trained = read_run(run)
     if cfg.stage != "score":
         predict(cfg, run)
-    score(cfg, run, trained)
+    if cfg.stage != "predict":
+        score(cfg, run, trained)
 
 
 def evaluation_folder(cfg: DictConfig, run: Path) -> Path:
     """Where the files of this evaluation lie: named by what differs from the plain one."""
     changed = [f"{key}-{value}" for key, value in _leaves(OmegaConf.to_container(cfg.postprocess))]
     every = [f"every-{cfg.every}"] if cfg.every > 1 else []
-    return run / "evaluation" / "_".join([cfg.split, *every, *changed]).replace("/", "-")
+    other = [Path(cfg.data.root).name] if cfg.data.root else []
+    return run / "evaluation" / "_".join([cfg.split, *other, *every, *changed]).replace("/", "-")
 
 
 def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -69,7 +71,10 @@ def open_scenes(cfg: DictConfig, trained: DictConfig) -> tuple["SceneFolder", st
 def recovery_settings(cfg: DictConfig, trained: DictConfig) -> DictConfig:
     """The run's post-processing with this evaluation's changes; an unknown key is an error."""
     merged = OmegaConf.create(OmegaConf.to_container(trained.postprocess, resolve=True))
-    OmegaConf.set_struct(merged, True)
+    known = list(key_paths(OmegaConf.to_container(merged)))
+    for key in key_paths(OmegaConf.to_container(cfg.postprocess)):
+        if key not in known:
+            raise ValueError(f"postprocess.{key}: unknown key{closest(key, known)}")
     return OmegaConf.merge(merged, cfg.postprocess)  # type: ignore[return-value]
 
 

@@ -1,6 +1,7 @@
 """pnet-generate: make a data set."""
 
 import os
+from collections import Counter
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -32,7 +33,8 @@ def generate_data(cfg: DictConfig) -> None:
     grid_sizes = {name: len(grid) for name, grid in factory.part.grids.items()}
     tasks = factory.protocol.tasks(grid_sizes)  # may refuse the settings, so before anything is written
     root = Path(cfg.data.root)
-    open_root(root, settings)
+    files = Counter(task.split for task in tasks)
+    open_root(root, {**settings, "files": dict(files)})  # by which a reader sees that none is missing
     workers = os.cpu_count() or 1 if cfg.workers is None else cfg.workers
     summary, start = Summary(), perf_counter()
     with scene_progress(len(tasks), len(factory.protocol.scene_drops())) as advance:

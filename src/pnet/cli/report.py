@@ -40,7 +40,11 @@ def report(cfg: DictConfig) -> None:
     metrics = read_json(evaluation / "metrics.json")
     header, found = read_predictions(evaluation / PREDICTIONS)
     part = instantiate(trained.part)
-    scenes = SceneFolder(data_root(header.data, trained), header.split, identity(trained)["part"])
+    scenes = SceneFolder(
+        data_root(header.data, Path(cfg.data.root or trained.data.root)),
+        header.split,
+        identity(trained)["part"],
+    )
     shown = pick_scenes(header.scenes, cfg.scenes)
     folder = run / "report"
     folder.mkdir(exist_ok=True)
@@ -54,13 +58,14 @@ def report(cfg: DictConfig) -> None:
     out.print(f"report: {folder / 'report.html'}\npicture: {folder / 'scene.png'}")
 
 
-def data_root(fingerprint: str, trained: DictConfig) -> Path:
-    """The run's data folder, if it still holds the data that was predicted."""
+def data_root(fingerprint: str, root: Path) -> Path:
+    """The data folder, if it holds the data that was predicted."""
     from pnet.scenes.generation import read_manifest, settings_fingerprint
 
-    root = Path(trained.data.root)
     if settings_fingerprint(read_manifest(root)) != fingerprint:
-        raise ValueError(f"{root}: is not the data that the predictions were made from; evaluate again")
+        raise ValueError(
+            f"{root}: is not the data that the predictions were made from; give data.root, or evaluate again"
+        )
     return root
 
 

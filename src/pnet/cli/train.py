@@ -32,17 +32,15 @@ def train(cfg: DictConfig) -> None:
     from pnet.engine.estimator import NetworkEstimator
     from pnet.engine.provenance import provenance, read_json, write_json
     from pnet.engine.training import PoseTraining, check_identity
+    from pnet.scenes.generation import read_manifest, settings_fingerprint
     from pnet.scenes.store import write_atomically
 
     if cfg.trainer.threads is not None:
         torch.set_num_threads(cfg.trainer.threads)
     run = Path(cfg.run_dir)
     checkpoint = resume_from(cfg.ckpt, run / "checkpoints" / NAME)
-    if checkpoint is not None and is_finished(run, cfg.trainer.steps):
-        print_end(run, read_json(run / "metrics.json"))
-        return
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
-    parts, bf16 = build_parts(cfg), use_bf16(cfg.trainer.precision)
+    parts, bf16 = build_parts(cfg), use_bf16(cfg.trainer.precision, cfg.trainer.accelerator)
     data = build_data(cfg, parts.part)
     validation = data.scenes("val", cfg.data.val_every)
     data.train_dataloader()  # says now, before anything is written, what is wrong with the data
@@ -53,7 +51,7 @@ def train(cfg: DictConfig) -> None:
         instantiate(cfg.optimizer),
         instantiate(cfg.schedule),
         bf16,
-        identity(cfg),
+        {**identity(cfg), "data": settings_fingerprint(read_manifest(data.root))},
     )
     throughput = Throughput()
     estimator = NetworkEstimator(parts.part, parts.network, parts.recovery, bf16)
@@ -64,7 +62,12 @@ def train(cfg: DictConfig) -> None:
     ]
     trainer = build_trainer(cfg, run, callbacks)
     if checkpoint is not None:  # before the settings of the run are replaced
-        check_identity(read_checkpoint(checkpoint), identity(cfg))
+        check_identity(read_checkpoint(checkpoint), module.identity)
+        if cfg.ckpt == "auto":
+            check_same_settings(run, cfg)
+        if is_finished(run, cfg.trainer.steps):
+            print_end(run, read_json(run / "metrics.json"))
+            return
     run.mkdir(parents=True, exist_ok=True)
     write_atomically(run / CONFIG, OmegaConf.to_yaml(cfg).encode())
     write_atomically(run / RESOLVED, OmegaConf.to_yaml(cfg, resolve=True).encode())
@@ -74,6 +77,8 @@ def train(cfg: DictConfig) -> None:
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     except SystemExit:  # what Lightning makes of Ctrl-C
         raise KeyboardInterrupt from None
+    if "val/AP" not in trainer.callback_metrics:  # killed after the last step: validated but not written
+        trainer.validate(module, datamodule=data, verbose=False)
     metrics = final_metrics(trainer, throughput)
     log_settings(trainer, cfg, metrics)
     write_json(run / "metrics.json", metrics)
@@ -123,6 +128,21 @@ def is_finished(run: Path, steps: int) -> bool:
     return path.is_file() and int(read_json(path).get("steps") or 0) >= steps
 
 
+def check_same_settings(run: Path, cfg: DictConfig) -> None:
+    """Raise ValueError where a run was begun with other settings than these; names the first few."""
+    from pnet.cli.build import read_run
+    from pnet.scenes.generation import differences
+
+    free = ("ckpt", "run_dir", "trainer.threads")  # decide nothing
+    old, new = (OmegaConf.to_container(c, resolve=True) for c in (read_run(run), cfg))
+    differing = sorted(text for text in differences(old, new) if not text.startswith(free))
+    if differing:
+        raise ValueError(
+            f"{run}: holds a training with other settings: {'; '.join(differing[:4])}. "
+            "Choose another run_dir, or delete that folder"
+        )
+
+
 def build_trainer(cfg: DictConfig, run: Path, callbacks: list["lightning.Callback"]) -> "lightning.Trainer":
     """The Lightning trainer: an epoch lasts from one checkpoint to the next."""
     import lightning
@@ -130,6 +150,8 @@ def build_trainer(cfg: DictConfig, run: Path, callbacks: list["lightning.Callbac
     from lightning.pytorch.loggers import TensorBoardLogger
 
     options = cfg.trainer
+    if options.devices != 1:
+        raise ValueError(f"trainer.devices is {options.devices}: training runs on one device, set it to 1")
     if options.validate_every % options.checkpoint_every:
         raise ValueError(
             f"trainer.validate_every ({options.validate_every}) must be a multiple of "

@@ -61,6 +61,8 @@ class SceneDataModule(lightning.LightningDataModule):
         seed: int,
     ) -> None:
         super().__init__()
+        if points is not None and points < 1:
+            raise ValueError(f"data.points is {points}, expected at least 1, or null for all")
         if batch_size < 1:
             raise ValueError(f"data.batch_size is {batch_size}, expected at least 1")
         self.part, self.root, self.targets, self.points = part, Path(root), targets, points
@@ -89,6 +91,11 @@ class SceneDataModule(lightning.LightningDataModule):
         """Validation scenes as they are."""
         scenes = self.scenes("val", self._val_every)
         dataset = LabelledScenes(scenes, self.part.chain, self.targets.choice, self.points)
+        return self._loader(dataset, None, drop_last=False)
+
+    def test_dataloader(self, split: str = "test_l") -> DataLoader[Any]:
+        """Scenes of a test split as they are: test_l (part objects of the training) or test_g (others)."""
+        dataset = LabelledScenes(self.scenes(split), self.part.chain, self.targets.choice, self.points)
         return self._loader(dataset, None, drop_last=False)
 
     def _loader(

@@ -6,6 +6,7 @@ from itertools import accumulate
 from pathlib import Path
 
 from pnet.records import Scene, SceneId
+from pnet.scenes.generation import MANIFEST, read_manifest
 from pnet.scenes.store import SUFFIX, CycleFile
 
 
@@ -26,7 +27,12 @@ class SceneFolder(Sequence[Scene]):
             raise FileNotFoundError(
                 f"{root / split}: no scenes there; run pnet-generate with the same part and protocol first"
             )
+        _check_complete(root, split, len(self._paths))
         files = [CycleFile(path) for path in self._paths]
+        if len({file.header.fingerprint for file in files}) > 1:
+            raise ValueError(
+                f"{root / split}: made with different settings; delete it and make the data anew"
+            )
         for file in files:
             if file.header.part != part:
                 raise ValueError(
@@ -65,3 +71,15 @@ class SceneFolder(Sequence[Scene]):
         if path not in self._open:
             self._open[path] = CycleFile(path)
         return self._open[path]
+
+
+def _check_complete(root: Path, split: str, found: int) -> None:
+    """Refuse a split of which generation has not made all files yet."""
+    if not (root / MANIFEST).exists():
+        return
+    planned = read_manifest(root).get("files", {}).get(split, found)
+    if found < planned:
+        raise ValueError(
+            f"{root / split}: only {found} of {planned} cycles are there; run pnet-generate again, "
+            "which makes what is missing"
+        )

@@ -50,6 +50,11 @@ class NetworkEstimator:
             return [no_detections(self.part, 0) for _ in points]
         if not bool(torch.isfinite(points).all()):
             raise ValueError("the cloud has NaN or infinite coordinates; remove those points first")
+        if bool((points[..., 2] <= 0).any()):
+            raise ValueError(
+                "the cloud has points at or behind the camera (z <= 0); remove them, or turn the cloud into "
+                "the camera frame: x right, y down, z forward, metres"
+            )
         device = next(self.network.parameters()).device
         training = self.network.training
         self.network.eval()

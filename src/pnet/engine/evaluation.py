@@ -72,5 +72,7 @@ class SceneScorer:
     def _space(self, scene: Scene) -> PoseSpace:
         key = scene.parameters[:1].tobytes()
         if key not in self._spaces:
-            self._spaces[key] = self._part.pose_space(scene.parameters[0])
+            # an empty scene has no part object; any pose distance does where there is no true pose
+            sizes = scene.parameters[0] if len(scene.parameters) else self._part.part_object("L", 0)
+            self._spaces[key] = self._part.pose_space(sizes)
         return self._spaces[key]

@@ -41,7 +41,7 @@ class PoseTraining(lightning.LightningModule):
         self.network = network
         self.loss = loss
         self._optimizer, self._schedule = optimizer, schedule
-        self._bf16, self._identity = bf16, identity
+        self._bf16, self.identity = bf16, identity
 
     def training_step(self, batch: Batch, index: int) -> Tensor:
         """Loss of a batch; each module's own is logged."""
@@ -70,11 +70,11 @@ class PoseTraining(lightning.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keep what the weights belong to."""
-        checkpoint["pnet"] = dict(self._identity)
+        checkpoint["pnet"] = dict(self.identity)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse a checkpoint of another part or network."""
-        check_identity(checkpoint, self._identity)
+        check_identity(checkpoint, self.identity)
 
     def _losses(self, batch: Batch) -> dict[str, Tensor]:
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16):

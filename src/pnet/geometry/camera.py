@@ -71,5 +71,7 @@ class Camera:
             raise ValueError(
                 f"depth image has shape {depth.shape}, the camera expects {(self.height, self.width)}"
             )
+        if (depth < 0).any():
+            raise ValueError(f"depth image has negative values (lowest {np.nanmin(depth):g} m)")
         v, u = np.mgrid[: self.height, : self.width]
         return self.rays(u, v) * depth[..., None]

@@ -1,7 +1,7 @@
 """Mean shift with a flat kernel and binned seeds (Comaniciu and Meer 2002, the paper's [22]).
 
-The same clusters as scikit-learn's `MeanShift(bin_seeding=True)`, which searches seed by seed: here all
-seeds move together, by matrix products.
+The same clusters as scikit-learn's `MeanShift(bin_seeding=True, cluster_all=False)`, which searches seed
+by seed: here all seeds move together, by matrix products.
 """
 
 import torch

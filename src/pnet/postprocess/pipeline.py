@@ -20,7 +20,7 @@ class PoseRecovery:
 
     Attributes:
         cluster: instance segmentation. radius_filter: None is the ablation "w/o RF".
-        visibility_threshold: T_v; instances with a lower voted visibility are left out.
+        visibility_threshold: T_v; instances with a lower voted visibility are left out (with M_V only).
         scene_parameters: average the parameters over the scene's best visible instances, as the released
             code does: right where a scene holds one part object. best_visible: those whose visibility
             exceeds this share of the scene's highest.
@@ -43,8 +43,8 @@ class PoseRecovery:
         Args:
             part: the template. prediction: of a batch. scene: index into the batch.
         """
-        centroids = prediction.centroid[scene].double().cpu()
-        keypoints = prediction.keypoints[scene].double().cpu()
+        centroids = prediction.centroid[scene].cpu().double()
+        keypoints = prediction.keypoints[scene].cpu().double()
         labels = self.cluster(centroids)
         d = int(labels.max()) + 1 if len(labels) else 0
         if d == 0:
@@ -55,7 +55,9 @@ class PoseRecovery:
         parameters = self._parameters(part.chain, centroids, keypoints, labels, visibility)
         R, t = fit_pose(part.chain, part.mirror, parameters, votes[:, 0], votes[:, 1:], weight)
         found = Detections(R, t, parameters, visibility, votes[:, 1:], labels)
-        return best_first(found, visibility >= self.visibility_threshold)
+        # without M_V nothing is known of visibility, so nothing is left out for it
+        threshold = self.visibility_threshold if prediction.visibility is not None else 0.0
+        return best_first(found, visibility >= threshold)
 
     def _vote_all(self, targets: Tensor, labels: Tensor, d: int) -> tuple[Tensor, Tensor | None]:
         """Voted centroid and keypoints (d, 1 + m, 3), and their weights in the fit (d, 1 + m)."""
@@ -74,7 +76,7 @@ class PoseRecovery:
     def _score(self, prediction: PointPrediction, scene: int, labels: Tensor, d: int) -> Tensor:
         """(d,) voted visibility; without M_V each cluster's number of points over the largest."""
         if prediction.visibility is not None:
-            return vote(prediction.visibility[scene].double().cpu(), labels, labels >= 0, d)
+            return vote(prediction.visibility[scene].cpu().double(), labels, labels >= 0, d)
         size = torch.bincount(labels[labels >= 0], minlength=d).double()
         return size / size.max()
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 
@@ -37,10 +38,11 @@ class RadiusFilter:
         return kept
 
     def _kept(self, votes: Tensor) -> Tensor:
-        distance = torch.cdist(votes, votes)
-        radius = self.radius
+        places = votes.double().cpu().numpy()
+        tree, radius = cKDTree(places), self.radius
         while True:
-            kept = (distance <= radius).sum(1) - 1 >= self.neighbours
+            near = tree.query_ball_point(places, radius, return_length=True)
+            kept = torch.from_numpy(near - 1 >= self.neighbours).to(votes.device)
             if float(kept.double().mean()) >= self.enough:
                 return kept
             radius += self.widen

@@ -22,15 +22,7 @@ def scene_progress(cycles: int, scenes_per_cycle: int) -> Iterator[Callable[[boo
     Yields:
         A function to call after each cycle; its argument says whether the cycle was made now.
     """
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns) as progress:
+    with _bar() as progress:
         task = progress.add_task("cycles", total=cycles, rate="")
         made = 0
 
@@ -53,15 +45,7 @@ def count_progress(what: str, total: int, unit: str) -> Iterator[Callable[[int],
     Yields:
         A function to call with how many more are done.
     """
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns) as progress:
+    with _bar() as progress:
         task = progress.add_task(what, total=total, rate="")
 
         def advance(more: int) -> None:
@@ -70,3 +54,14 @@ def count_progress(what: str, total: int, unit: str) -> Iterator[Callable[[int],
             progress.update(task, advance=more, rate=rate)
 
         yield advance
+
+
+def _bar() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )

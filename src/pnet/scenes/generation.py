@@ -4,7 +4,7 @@ import json
 import os
 import signal
 from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from dataclasses import astuple, dataclass, field
 from hashlib import sha256
 from multiprocessing import get_context, parent_process
@@ -81,7 +81,7 @@ def open_root(root: Path, settings: Mapping[str, Any]) -> None:
     manifest = root / MANIFEST
     if manifest.exists():
         found = read_manifest(root)
-        differing = sorted(_differences(found, settings))
+        differing = sorted(differences(found, settings))
         if differing:
             raise ValueError(
                 f"{manifest}: this data was made with other settings: {'; '.join(differing[:4])}. "
@@ -155,6 +155,10 @@ def _in_parallel(
             done, running = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
                 yield future.result()
+    except BrokenExecutor as fault:
+        raise OSError(
+            "a worker process was killed (out of memory?); the same command goes on, workers=1 needs less"
+        ) from fault
     finally:
         processes = list((pool._processes or {}).values())
         pool.shutdown(wait=not running, cancel_futures=True)
@@ -219,9 +223,10 @@ def _is_running(temporary: Path) -> bool:
     return True
 
 
-def _differences(old: Any, new: Any, path: str = "") -> Iterator[str]:
+def differences(old: Any, new: Any, path: str = "") -> Iterator[str]:
+    """Where two nested settings differ, as "key was 1, now 2"."""
     if isinstance(old, Mapping) and isinstance(new, Mapping):
         for key in {*old, *new}:
-            yield from _differences(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
+            yield from differences(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
     elif old != new:
         yield f"{path} was {old!r}, now {new!r}"

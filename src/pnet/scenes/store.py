@@ -106,6 +106,8 @@ class CycleFile:
                 self._open_arrays()
         except FileNotFoundError:
             raise FileNotFoundError(f"{path}: no such cycle file; run pnet-generate") from None
+        except PermissionError as fault:
+            raise PermissionError(f"{path}: not allowed to read it") from fault
         except (SafetensorError, LookupError, TypeError, ValueError, AttributeError, OSError) as fault:
             raise _damaged(path, str(fault)) from fault
         if newer:
