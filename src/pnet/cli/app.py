@@ -12,7 +12,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException
+from hydra.errors import HydraException, InstantiationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
@@ -65,6 +65,8 @@ def error_text(fault: BaseException) -> str:
     """What to tell the user, on one line."""
     if isinstance(fault, MissingMandatoryValue):
         return f"{fault.full_key} is missing: give {fault.full_key}=…; --help says what it is"
+    if isinstance(fault, InstantiationException) and fault.__cause__ is not None:
+        return error_text(fault.__cause__)  # what our own constructor says is clearer than Hydra's wrapping
     lines = str(fault).strip().splitlines() or [type(fault).__name__]
     if lines[0].startswith("Caught "):  # a loader's worker sends its whole traceback: the end says it
         lines = lines[-1:]
@@ -128,7 +130,7 @@ def _hint(folder: Path, config_name: str, override: Override, good: list[str], f
         return f"{key}={value}: no such choice{closest(value, choices)}; there are {', '.join(choices)}"
     cfg = compose(config_name, overrides=good)
     groups = [path.name for path in folder.iterdir() if path.is_dir()]
-    keys = [*key_paths(OmegaConf.to_container(cfg)), *groups]
+    keys = list(dict.fromkeys([*key_paths(OmegaConf.to_container(cfg)), *groups]))
     if key not in keys:
         return f"{key}: unknown key{closest(key, keys)}; `{Path(sys.argv[0]).name} --cfg job` lists all keys"
     return f"{override.input_line}: {str(fault).splitlines()[0]}"
