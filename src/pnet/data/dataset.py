@@ -1,6 +1,7 @@
 """A torch Dataset of labelled scenes, and the order in which training sees them."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -57,8 +58,6 @@ class LabelledScenes(Dataset[dict[str, Tensor]]):
 
 def first_points(scene: Scene, count: int | None) -> Scene:
     """The scene with its first `count` points only; None keeps all."""
-    from dataclasses import replace
-
     if count is None:
         return scene
     return replace(scene, points=scene.points[:count], instance=scene.instance[:count])

@@ -89,13 +89,14 @@ class SceneDataModule(lightning.LightningDataModule):
 
     def val_dataloader(self) -> DataLoader[Any]:
         """Validation scenes as they are."""
-        scenes = self.scenes("val", self._val_every)
-        dataset = LabelledScenes(scenes, self.part.chain, self.targets.choice, self.points)
-        return self._loader(dataset, None, drop_last=False)
+        return self._unchanged(self.scenes("val", self._val_every))
 
     def test_dataloader(self, split: str = "test_l") -> DataLoader[Any]:
         """Scenes of a test split as they are: test_l (part objects of the training) or test_g (others)."""
-        dataset = LabelledScenes(self.scenes(split), self.part.chain, self.targets.choice, self.points)
+        return self._unchanged(self.scenes(split))
+
+    def _unchanged(self, scenes: SceneFolder) -> DataLoader[Any]:
+        dataset = LabelledScenes(scenes, self.part.chain, self.targets.choice, self.points)
         return self._loader(dataset, None, drop_last=False)
 
     def _loader(
