@@ -70,6 +70,8 @@ class Batch:
         points: (B, N, 3) camera frame, metres.
         centroid: (B, N, 3) label: centroid of the instance that the point lies on, metres.
         keypoints: (B, N, m, 3) label: its keypoints under the keypoint rule, metres.
+        margin: (B, N, m) by how much the runner-up among the equivalent keypoints is worse, metres;
+            infinite where there is none.
         parameters: (B, N, k) label: its parameters, metres.
         visibility: (B, N) label: its visibility.
         scene: (B,) index of each scene in the data set.
@@ -78,6 +80,7 @@ class Batch:
     points: Tensor
     centroid: Tensor
     keypoints: Tensor
+    margin: Tensor
     parameters: Tensor
     visibility: Tensor
     scene: Tensor

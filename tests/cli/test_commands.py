@@ -234,7 +234,7 @@ def test_a_finished_run_is_left_alone_and_other_settings_are_named(smoke_copy, r
 
 def test_going_on_with_other_labels_or_data_is_refused(smoke_copy, run_here):
     going_on = ("train", *TRAIN, "run_dir=outputs/run", "ckpt=last", "trainer.steps=8")
-    labels = run_here(smoke_copy.folder, *going_on, "data.targets.geometric_unique=false")
+    labels = run_here(smoke_copy.folder, *going_on, "data.targets.rule=canonical")
     assert "the checkpoint's targets is" in labels.error
     manifest = smoke_copy.data / "dataset.json"
     manifest.write_text(manifest.read_text().replace('"seed": 0', '"seed": 1'))

@@ -6,7 +6,7 @@ import torch
 
 from pnet.data.augmentation import Augmentation, rotate_about_view_axis
 from pnet.data.targets import point_labels
-from pnet.parts.keypoints import KeypointChoice
+from pnet.parts.choice import KeypointChoice
 
 
 def in_part_frame(scene):

@@ -11,7 +11,7 @@ from pnet.data.augmentation import Augmentation
 from pnet.data.dataset import EpochSampler, LabelledScenes, collate, first_points
 from pnet.data.scene_folder import SceneFolder
 from pnet.data.targets import point_labels
-from pnet.parts.keypoints import KeypointChoice
+from pnet.parts.choice import KeypointChoice
 
 CHOICE = KeypointChoice()
 
@@ -94,3 +94,5 @@ def test_collate_stacks(folder, tn34):
     assert batch.points.shape == (2, 10, 3) and batch.keypoints.shape == (2, 10, 3, 3)
     assert batch.scene.tolist() == [1, 4]
     assert torch.equal(batch.centroid[1], dataset[4]["centroid"])
+    assert batch.margin.shape == (2, 10, 3)
+    assert torch.equal(batch.margin[0], dataset[1]["margin"])

@@ -5,7 +5,7 @@ import torch
 
 from pnet.data.augmentation import Augmentation
 from pnet.data.module import SceneDataModule, Targets
-from pnet.parts.keypoints import KeypointRule
+from pnet.parts.choice import KeypointRule
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +37,7 @@ def test_shapes_of_a_batch(root, tn06):
         "points": (4, 100, 3),
         "centroid": (4, 100, 3),
         "keypoints": (4, 100, 3, 3),
+        "margin": (4, 100, 3),
         "parameters": (4, 100, 3),
         "visibility": (4, 100),
         "scene": (4,),
@@ -101,8 +102,30 @@ def test_a_missing_split_is_named(root, tn06):
 def test_targets_say_which_rule():
     assert Targets().choice.rule is KeypointRule.CAMERA
     assert Targets().choice.direction == (0, 0, 1)
-    assert Targets(geometric_unique=False).choice.rule is KeypointRule.CANONICAL
+    assert Targets(rule="canonical").choice.rule is KeypointRule.CANONICAL
+    assert Targets(rule="point").choice.rule is KeypointRule.POINT
     assert Targets(direction=[0, 1, 0]).choice.direction == (0, 1, 0)
+
+
+@pytest.mark.parametrize("rule", ["gu", "", "CAMERA", True])
+def test_an_unknown_rule_is_named_with_the_known_ones(rule):
+    with pytest.raises(
+        ValueError, match=rf"data\.targets\.rule is {rule!r}, choose camera, canonical, point"
+    ):
+        Targets(rule=rule).choice  # noqa: B018
+
+
+def test_the_loaders_labels_follow_the_rule(root, tn06):
+    """Under `point` labels differ between points of one body, under the other rules they do not."""
+    for rule, differ in (("camera", False), ("canonical", False), ("point", True)):
+        data = module(root, tn06, batch_size=1)
+        data.targets = Targets(rule=rule)
+        batch = next(iter(data.val_dataloader()))  # one body
+        faces = batch.keypoints[0, :, 0]
+        spread = (faces - faces[0]).norm(dim=-1).max()
+        height = batch.parameters[0, 0, 1]
+        assert float(spread) == pytest.approx(float(height) if differ else 0, abs=1e-7)
+        assert bool(batch.margin.isinf().all()) == (rule == "canonical")
 
 
 @pytest.mark.parametrize("direction", [[0, 0, 0], [1, 0], [0, 0, 1, 0]])

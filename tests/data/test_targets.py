@@ -9,13 +9,15 @@ import torch
 from pnet.data.augmentation import rotate_about_view_axis
 from pnet.data.targets import instance_keypoints, point_labels
 from pnet.geometry.camera import Camera
-from pnet.parts.keypoints import KeypointChoice, KeypointRule
-from pnet.parts.tn34 import CENTROID
+from pnet.parts.choice import KeypointChoice, KeypointRule
+from pnet.parts.tn16 import TN16
+from pnet.parts.tn42 import TN42
 from pnet.records import Scene, SceneId
 
-R_MM, H_MM = 0.012, 0.010
+R, H = 0.012, 0.010  # metres
 CAMERA = KeypointChoice(KeypointRule.CAMERA)
 CANONICAL = KeypointChoice(KeypointRule.CANONICAL)
+POINT = KeypointChoice(KeypointRule.POINT)
 UP_ON = np.eye(3)  # the flange's axis along the view axis
 LYING = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # the flange's axis towards the camera's −y
 
@@ -27,7 +29,7 @@ def two_flanges() -> Scene:
         instance=np.array([1, 0, 1]),
         R=np.stack([UP_ON, LYING]),
         t=np.array([[0, 0, 0.6], [0.1, 0, 0.61]]),
-        parameters=np.array([[R_MM, H_MM], [R_MM, H_MM]]),
+        parameters=np.array([[R, H], [R, H]]),
         visibility=np.array([0.25, 0.75]),
         occlusion=np.zeros(2),
         camera=Camera(8, 8, 10.0, 10.0, 3.5, 3.5),
@@ -44,23 +46,25 @@ def test_a_point_has_the_labels_of_its_own_instance(tn34):
         labels["centroid"], torch.tensor([[0.1, 0, 0.61], [0, 0, 0.6], [0.1, 0, 0.61]])
     )
     torch.testing.assert_close(labels["points"], torch.from_numpy(scene.points))
-    each = instance_keypoints(scene, tn34.chain, CAMERA).float()
+    each, margin = (value.float() for value in instance_keypoints(scene, tn34.chain, CAMERA))
     torch.testing.assert_close(labels["keypoints"], each[[1, 0, 1]])
-    assert labels["parameters"].tolist() == pytest.approx(np.tile([R_MM, H_MM], (3, 1)))
+    torch.testing.assert_close(labels["margin"], margin[[1, 0, 1]])
+    assert labels["parameters"].tolist() == pytest.approx(np.tile([R, H], (3, 1)))
     assert {value.dtype for value in labels.values()} == {torch.float32}
 
 
 def test_keypoints_of_a_lying_flange_by_hand(tn34):
-    base, top, rim = instance_keypoints(two_flanges(), tn34.chain, CAMERA)[1].tolist()
+    below = float(tn34.centroid(np.array([[R, H]]))[0, 2])  # the centroid's height over the base
+    base, top, rim = instance_keypoints(two_flanges(), tn34.chain, CAMERA)[0][1].tolist()
     # the part's z points to −y, so the base lies towards +y; the rim's nearest point lies towards −z
-    assert base == pytest.approx([0.1, CENTROID * H_MM, 0.61])
-    assert top == pytest.approx([0.1, CENTROID * H_MM - H_MM, 0.61])
-    assert rim == pytest.approx([0.1, CENTROID * H_MM, 0.61 - R_MM])
+    assert base == pytest.approx([0.1, below, 0.61])
+    assert top == pytest.approx([0.1, below - H, 0.61])
+    assert rim == pytest.approx([0.1, below, 0.61 - R])
 
 
 def test_without_gu_the_rim_is_the_templates_own(tn34):
-    base, _, rim = instance_keypoints(two_flanges(), tn34.chain, CANONICAL)[0].tolist()
-    assert np.subtract(rim, base) == pytest.approx([R_MM, 0, 0])
+    base, _, rim = instance_keypoints(two_flanges(), tn34.chain, CANONICAL)[0][0].tolist()
+    assert np.subtract(rim, base) == pytest.approx([R, 0, 0])
 
 
 @pytest.mark.parametrize(
@@ -75,8 +79,8 @@ def test_without_gu_the_rim_is_the_templates_own(tn34):
 )
 def test_the_direction_decides_where_the_rim_is(tn34, direction, side):
     choice = KeypointChoice(KeypointRule.CAMERA, direction)
-    base, _, rim = instance_keypoints(two_flanges(), tn34.chain, choice)[0].tolist()
-    assert np.subtract(rim, base) == pytest.approx(R_MM * np.array(side), abs=1e-12)
+    base, _, rim = instance_keypoints(two_flanges(), tn34.chain, choice)[0][0].tolist()
+    assert np.subtract(rim, base) == pytest.approx(R * np.array(side), abs=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -86,11 +90,13 @@ def test_gu_labels_turn_with_the_scene(part, make_scene, seed):
     turned = rotate_about_view_axis(scene, angle)
     c, s = np.cos(angle), np.sin(angle)
     turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
-    expected = instance_keypoints(scene, part.chain, CAMERA) @ turn.T
-    torch.testing.assert_close(instance_keypoints(turned, part.chain, CAMERA), expected, rtol=0, atol=1e-12)
+    keypoints, margin = instance_keypoints(scene, part.chain, CAMERA)
+    found, same_margin = instance_keypoints(turned, part.chain, CAMERA)
+    torch.testing.assert_close(found, keypoints @ turn.T, rtol=0, atol=1e-12)
+    torch.testing.assert_close(same_margin, margin, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("choice", [CAMERA, CANONICAL, KeypointChoice(KeypointRule.CAMERA, (0, 1, 0))])
+@pytest.mark.parametrize("choice", [CAMERA, CANONICAL, POINT, KeypointChoice(KeypointRule.CAMERA, (0, 1, 0))])
 def test_labels_give_back_the_parameters(part, make_scene, choice):
     labels = point_labels(make_scene(part), part.chain, choice)
     measured = part.chain.parameters_from_keypoints(labels["centroid"], labels["keypoints"])
@@ -107,4 +113,90 @@ def test_a_point_on_no_instance_is_an_error(tn34, number):
 def test_a_scene_without_points_has_no_labels(tn34):
     scene = two_flanges()
     empty = replace(scene, points=scene.points[:0], instance=scene.instance[:0])
-    assert point_labels(empty, tn34.chain, CAMERA)["keypoints"].shape == (0, 3, 3)
+    for choice in (CAMERA, CANONICAL, POINT):
+        labels = point_labels(empty, tn34.chain, choice)
+        assert labels["keypoints"].shape == (0, 3, 3) and labels["margin"].shape == (0, 3)
+
+
+def test_the_rule_point_is_not_one_of_an_instance(tn34):
+    with pytest.raises(ValueError, match="needs surface points"):
+        instance_keypoints(two_flanges(), tn34.chain, POINT)
+
+
+CIRCLE = np.linspace(0, 2 * np.pi, 3600, endpoint=False)
+
+
+def ring(radius: float, angles=CIRCLE) -> np.ndarray:
+    return radius * np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1)
+
+
+def candidates(part, size: np.ndarray, chosen: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Keypoint → every place that it may have beside its reference's; circles are sampled."""
+    x, y, z = np.eye(3)
+    below = part.centroid(size[None])[0]
+    if part.name == "tn06":
+        r, h, d = size
+        face = chosen.get("face", z)
+        return {
+            "face": np.outer([h / 2, -h / 2], z),
+            "hole": face + ring(r),
+            "vertex": face + ring(d, np.arange(6) * np.pi / 3),
+        }
+    if part.name == "tn34":
+        r, h = size
+        return {"base": -below[None], "top": (h * z - below)[None], "rim": ring(r) - below}
+    if part.name == "tn16":
+        r, h, c = size
+        end = chosen.get("end", z)
+        return {
+            "end": np.outer([h / 2, -h / 2], z),
+            "rim": end + ring(r),
+            "apex": (end * (1 + c / (h / 2)))[None],
+        }
+    length, a, w = size
+    return {
+        "foot": -below[None],
+        "toe": (length * x - below)[None],
+        "head": (a * z - below)[None],
+        "side": np.outer([w / 2, -w / 2], y),
+    }
+
+
+@pytest.fixture(params=["tn06", "tn34", "tn16", "tn42"])
+def pile(request, make_scene):
+    """A part and a scene of sixty bodies of sizes of their own."""
+    name = request.param
+    own = {
+        "tn16": lambda: TN16({"r": [8], "h": [20], "c": [6]}),
+        "tn42": lambda: TN42({"l": [36], "a": [13], "w": [11]}),
+    }
+    part = own[name]() if name in own else request.getfixturevalue(name)
+    scene = make_scene(part, bodies=60, points=600)
+    grow = 1 + np.random.default_rng(0).uniform(0, 0.1, (60, 1))
+    return part, replace(scene, parameters=scene.parameters * grow)
+
+
+def test_gu_labels_of_sixty_bodies_are_those_of_trying_every_place(pile):
+    part, scene = pile
+    labels, _ = instance_keypoints(scene, part.chain, CAMERA)
+    for i, (R_, t) in enumerate(zip(scene.R, scene.t, strict=True)):
+        chosen: dict[str, np.ndarray] = {}
+        for name, found in zip(part.chain.names, labels[i].numpy(), strict=True):
+            places = candidates(part, scene.parameters[i], chosen)[name]
+            chosen[name] = places[np.argmin((places @ R_.T)[:, 2])]
+            step = 2e-3 * scene.parameters[i].max() if len(places) == len(CIRCLE) else 1e-9
+            assert np.linalg.norm(R_ @ chosen[name] + t - found) < step, (i, name)
+
+
+def test_point_labels_of_sixty_bodies_are_those_of_trying_every_place(pile):
+    part, scene = pile
+    labels = point_labels(scene, part.chain, POINT)["keypoints"].double().numpy()
+    for n, i in enumerate(scene.instance):
+        local = (scene.points[n].astype(float) - scene.t[i]) @ scene.R[i]
+        chosen: dict[str, np.ndarray] = {}
+        for name, found in zip(part.chain.names, labels[n], strict=True):
+            places = candidates(part, scene.parameters[i], chosen)[name]
+            distance = np.linalg.norm(places - local, axis=1)
+            chosen[name] = places[np.argmin(distance)]
+            step = 2e-3 * scene.parameters[i].max() if len(places) == len(CIRCLE) else 1e-6
+            assert np.linalg.norm(scene.R[i] @ chosen[name] + scene.t[i] - found) < step, (n, name)

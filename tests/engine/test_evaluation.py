@@ -125,10 +125,11 @@ def estimator(tn34):
     from pnet.models.parametricnet import ParametricNet
     from pnet.postprocess.cluster import CentroidClusters
     from pnet.postprocess.pipeline import PoseRecovery
+    from pnet.postprocess.vote import MeanVote
 
     torch.manual_seed(0)
     backbone = PointNet2([Level(16, 0.05, 8, [8])], [[12]])
-    recovery = PoseRecovery(CentroidClusters(0.01, 5, 10), None, 0.0, False, 0.9, None)
+    recovery = PoseRecovery(CentroidClusters(0.01, 5, 10), None, MeanVote(), 0.0, False, 0.9, None)
     return NetworkEstimator(tn34, ParametricNet(backbone, 3, [8], [8], 0.02, True), recovery)
 
 

@@ -20,6 +20,7 @@ from pnet.models.losses import ParametricLoss
 from pnet.models.parametricnet import ParametricNet
 from pnet.postprocess.cluster import CentroidClusters
 from pnet.postprocess.pipeline import PoseRecovery
+from pnet.postprocess.vote import MeanVote
 
 EPOCH_STEPS, EPOCHS = 3, 3
 
@@ -63,7 +64,7 @@ def fit(root, part, folder, backbone, seed=0, interrupt=None, resume=False, iden
     data = SceneDataModule(
         part, root, Targets(), Augmentation(True, 1e-4), None, 2, 2 * EPOCH_STEPS, 1, 0, seed
     )
-    recovery = PoseRecovery(CentroidClusters(0.01, 2, 4), None, 0.0, False, 0.9, None)
+    recovery = PoseRecovery(CentroidClusters(0.01, 2, 4), None, MeanVote(), 0.0, False, 0.9, None)
     validation = PoseValidation(NetworkEstimator(part, network, recovery), data.scenes("val"), None, 0)
     callbacks = [validation, ResumableCheckpoint(folder), *extra]
     callbacks += [InterruptAt(interrupt)] if interrupt else []
@@ -137,6 +138,8 @@ def test_losses_and_poses_of_validation_are_logged(root, tn34, tmp_path):
     for stage in ("train", "val"):
         for term in ("centroid", "keypoints", "parameters", "visibility"):
             assert f"{stage}_loss/{term}" in metrics
+    shares = {name: float(metrics[f"ambiguous_labels/{name}"]) for name in tn34.chain.names}
+    assert shares["base"] == shares["top"] == 0 and 0 <= shares["rim"] <= 1
 
 
 def test_training_learns(root, tn34, tmp_path):

@@ -10,10 +10,11 @@ import torch
 from pnet.data.dataset import collate
 from pnet.data.targets import point_labels
 from pnet.models.losses import Norm, ParametricLoss
-from pnet.parts.keypoints import KeypointChoice
+from pnet.parts.choice import KeypointChoice
 from pnet.records import Batch, PointPrediction
 
 NORMS = list(Norm)
+INF = math.inf
 
 
 @pytest.fixture
@@ -25,6 +26,18 @@ def batch(part, make_scene) -> Batch:
 
 def perfect(batch: Batch) -> PointPrediction:
     return PointPrediction(batch.centroid, batch.keypoints, batch.visibility)
+
+
+def point(margin: list[float]) -> Batch:
+    """One point of a flange, r = h = 2; base, top and rim with these margins."""
+    zero = torch.zeros(1, 1, 3)
+    keypoints = torch.tensor([[[[0, 0, -1.0], [0, 0, 1], [2, 0, -1]]]])
+    size = torch.full((1, 1, 2), 2.0)
+    return Batch(zero, zero, keypoints, torch.tensor([[margin]]), size, torch.zeros(1, 1), torch.zeros(1))
+
+
+def moved(batch: Batch, offsets: list[list[float]]) -> PointPrediction:
+    return PointPrediction(batch.centroid, batch.keypoints + torch.tensor(offsets), batch.visibility)
 
 
 def noisy(batch: Batch) -> PointPrediction:
@@ -109,17 +122,82 @@ def test_without_the_visibility_module_its_term_is_missing(part, batch):
 
 def test_by_hand(tn34):
     """One point, every error along one axis."""
-    zero = torch.zeros(1, 1, 3)
-    keypoints = torch.tensor([[[[0, 0, -1.0], [0, 0, 1], [1, 0, -1]]]])
-    batch = Batch(zero, zero, keypoints, torch.zeros(1, 1, 2), torch.zeros(1, 1), torch.zeros(1))
-    moved = keypoints + torch.tensor([[3.0, 0, 0], [0, 4, 0], [0, 0, 0]])
-    predicted = PointPrediction(zero + torch.tensor([0, 2.0, 0]), moved, torch.full((1, 1), 0.25))
+    batch = point([INF] * 3)
+    shifted = moved(batch, [[3.0, 0, 0], [0, 4, 0], [0, 0, 0]])
+    predicted = replace(
+        shifted, centroid=batch.centroid + torch.tensor([0, 2.0, 0]), visibility=torch.full((1, 1), 0.25)
+    )
     values = {norm: ParametricLoss(tn34.chain, norm)(predicted, batch) for norm in NORMS}
     assert [float(values[n]["centroid"]) for n in ("squared", "distance", "each")] == pytest.approx([4, 2, 2])
     assert [float(values[n]["keypoints"]) for n in ("squared", "distance", "each")] == pytest.approx(
         [25, 5, 7]
     )
     assert float(values["each"]["visibility"]) == 0.25
+
+
+@pytest.mark.parametrize(
+    ("margin", "trust"),
+    [
+        ([INF, INF, INF], [1, 1, 1]),
+        ([INF, INF, 0.0], [1, 1, 0]),
+        ([INF, 0.002, 0.002], [1, 0.5, 0.5]),
+        ([0.006, 0.002, 0.0], [0.75, 0.5, 0]),
+        ([0.0, 0.0, 0.0], [0, 0, 0]),
+    ],
+)
+def test_a_label_counts_by_its_margin_over_margin_and_scale(tn34, margin, trust):
+    """Scale 2 mm, errors 3, 4 and 12. `each` weighs distances, the others squares."""
+    batch = point(margin)
+    predicted = moved(batch, [[3.0, 0, 0], [0, 4, 0], [0, 0, 12]])
+    found = {n: float(ParametricLoss(tn34.chain, n, 0.002)(predicted, batch)["keypoints"]) for n in NORMS}
+    squares = sum(w * e * e for w, e in zip(trust, (3, 4, 12), strict=True))
+    distances = sum(w * e for w, e in zip(trust, (3, 4, 12), strict=True))
+    assert found["squared"] == pytest.approx(squares, abs=1e-6)
+    assert found["distance"] == pytest.approx(math.sqrt(squares), abs=1e-6)
+    assert found["each"] == pytest.approx(distances, abs=1e-6)
+
+
+@pytest.mark.parametrize("norm", NORMS)
+def test_a_margin_touches_the_keypoints_loss_only(part, batch, norm):
+    predicted = noisy(batch)
+    plain, weighed = ParametricLoss(part.chain, norm), ParametricLoss(part.chain, norm, margin=0.002)
+    one, other = plain(predicted, batch), weighed(predicted, batch)
+    for name in ("centroid", "parameters", "visibility"):
+        assert torch.equal(one[name], other[name])
+    assert 0 < float(other["keypoints"]) < float(one["keypoints"])
+    sure = replace(batch, margin=torch.full_like(batch.margin, INF))
+    torch.testing.assert_close(weighed(predicted, sure)["loss"], one["loss"])
+
+
+@pytest.mark.parametrize("norm", NORMS)
+@pytest.mark.parametrize("margin", [[0.0, 0.0, 0.0], [INF, 0.0, 1e-12], [INF, INF, 0.003]])
+@pytest.mark.parametrize("error", [0.0, 1e-12, 0.01])
+def test_gradients_are_finite_whatever_margin_and_error(tn34, norm, margin, error):
+    batch = point(margin)
+    keypoints = (batch.keypoints + error).requires_grad_()
+    predicted = PointPrediction(batch.centroid, keypoints, batch.visibility)
+    loss = ParametricLoss(tn34.chain, norm, 0.002)(predicted, batch)["keypoints"]
+    loss.backward()
+    assert math.isfinite(loss.item()) and bool(keypoints.grad.isfinite().all())
+    gradient = keypoints.grad[0, 0].norm(dim=-1)
+    for own, trusted in zip(gradient.tolist(), margin, strict=True):
+        if trusted == 0:
+            assert own == 0  # a label that is a tie teaches nothing
+        elif error == 0.01 and trusted == INF:
+            assert own > 1e-3
+
+
+@pytest.mark.parametrize("margin", [0.0, -0.001])
+def test_a_margin_that_is_no_length_is_refused(tn34, margin):
+    with pytest.raises(ValueError, match=r"loss\.margin is .*, expected a positive length in metres or null"):
+        ParametricLoss(tn34.chain, "each", margin=margin)
+
+
+def test_ambiguity_is_the_share_of_labels_with_a_near_runner_up(tn34):
+    rows = [[INF, 0.0, 0.0005], [INF, 0.002, 0.0009], [INF, INF, 0.0011], [INF, 0.003, 0.0]]
+    batch = replace(point([INF] * 3), margin=torch.tensor([rows[:2], rows[2:]]))
+    share = ParametricLoss(tn34.chain, "squared").ambiguity(batch)
+    assert {name: float(value) for name, value in share.items()} == {"base": 0, "top": 0.25, "rim": 0.75}
 
 
 def test_an_unknown_norm_is_refused(tn34):

@@ -1,31 +1,25 @@
-"""Keypoints from parameters and back; the geometrically unique choice."""
+"""Keypoints from parameters and back, and what the chain tells the fit."""
 
 import math
 
+import numpy as np
 import pytest
-import roma
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pnet.geometry.rigid import apply_pose
-from pnet.geometry.symmetry import FiniteSymmetry, rotation_about_z
-from pnet.parts.keypoints import Keypoint, KeypointChain, KeypointChoice, KeypointRule
-from pnet.parts.orbits import RingOrbit, pair_orbit, point_orbit, polygon_orbit
+from pnet.geometry.symmetry import RevolutionSymmetry, SphericalSymmetry, cyclic, dihedral, reflection
+from pnet.parts.choice import KeypointChoice, KeypointRule, NearestToCamera, NearestToPoint
+from pnet.parts.keypoints import Keypoint, KeypointChain, cone_keypoints, select_keypoints
+from pnet.parts.primitives import Circle, Corner, Cylinder, Plane, Polygon, Sphere
 
 CHOICES = {
     "equation 1": KeypointChoice(),
     "oblique": KeypointChoice(direction=(0.4, -0.7, 0.5)),
     "canonical": KeypointChoice(KeypointRule.CANONICAL),
 }
-NEAR_SIDE_UP = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
-
-
-@pytest.fixture(autouse=True)
-def seed():
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        yield
+NUT = torch.tensor([0.004, 0.010, 0.012], dtype=torch.float64)
 
 
 @pytest.fixture(params=CHOICES.values(), ids=CHOICES.keys())
@@ -33,196 +27,213 @@ def choice(request):
     return request.param
 
 
-@pytest.fixture
-def cylinder() -> KeypointChain:
-    """A face centre and a point on its rim; two keypoints measure the radius."""
-    keypoints = [
-        Keypoint("face", "centroid", pair_orbit((0, 0, 1)), "h", 0.5),
-        Keypoint("rim", "face", RingOrbit(), "r"),
-        Keypoint("side", "centroid", RingOrbit(), "r", 2.0),
-    ]
-    return KeypointChain(keypoints, ["r", "h"])
+def random_points(n: int, seed: int = 3) -> torch.Tensor:
+    return 0.02 * torch.randn(n, 3, generator=torch.Generator().manual_seed(seed)).double()
 
 
-def random_instances(part, n: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Parameters (n, k) from 5 to 25 mm, R (n, 3, 3), t (n, 3)."""
-    parameters = 0.005 + 0.02 * torch.rand(n, len(part.parameter_names), dtype=torch.float64)
-    return parameters, roma.random_rotmat(n, dtype=torch.float64), 0.3 * torch.randn(n, 3).double()
+def test_parameters_come_back_from_the_labels_in_any_pose(chain, choice, rotations, sizes):
+    parameters, R, t = sizes(chain, 50), rotations(50), random_points(50)
+    labels, _ = chain.select(choice, parameters, R)
+    found = chain.parameters_from_keypoints(t, apply_pose(R, t, labels))
+    torch.testing.assert_close(found, parameters, atol=1e-12, rtol=0)
 
 
-def symmetries(part) -> torch.Tensor:
-    """(g, 3, 3) rotations that leave the part as it is."""
-    if isinstance(part.symmetry, FiniteSymmetry):
-        return part.symmetry.rotations
-    return rotation_about_z(2 * math.pi * torch.rand(8).double())
-
-
-def test_parameters_come_back_from_the_keypoints_in_any_pose(part, choice):
-    parameters, R, t = random_instances(part, 50)
-    keypoints = apply_pose(R, t, part.chain.select(choice, parameters, R))
-    found = part.chain.parameters_from_keypoints(t, keypoints)
+def test_parameters_come_back_from_the_labels_nearest_to_a_point(chain, sizes):
+    parameters = sizes(chain, 50)
+    labels, _ = chain.choose(NearestToPoint(random_points(50)), chain.canonical(parameters))
+    found = chain.parameters_from_keypoints(torch.zeros(50, 3).double(), labels)
     torch.testing.assert_close(found, parameters, atol=1e-12, rtol=0)
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.floats(1e-4, 1.0), min_size=3, max_size=3))
-def test_any_positive_parameters_come_back(tn06, values):
+def test_any_positive_parameters_come_back(declare, values):
     parameters = torch.tensor(values, dtype=torch.float64)
-    keypoints = tn06.chain.canonical(parameters)
-    found = tn06.chain.parameters_from_keypoints(torch.zeros(3).double(), keypoints)
-    torch.testing.assert_close(found, parameters, atol=1e-12, rtol=1e-12)
+    for name in ("nut", "wedge", "double cone", "lug"):
+        chain = declare(name)
+        found = chain.parameters_from_keypoints(torch.zeros(3).double(), chain.canonical(parameters))
+        torch.testing.assert_close(found, parameters, atol=1e-12, rtol=1e-12)
 
 
-def test_batch_dimensions_and_dtype_are_kept(part, choice):
-    parameters, R, _ = random_instances(part, 6)
-    k, m = parameters.shape[1], len(part.chain)
-    keypoints = part.chain.select(choice, parameters.float().reshape(2, 3, k), R.float().reshape(2, 3, 3, 3))
-    assert keypoints.shape == (2, 3, m, 3) and keypoints.dtype == torch.float32
-    one_by_one = torch.stack([part.chain.select(choice, p, r) for p, r in zip(parameters, R, strict=True)])
-    torch.testing.assert_close(keypoints.flatten(0, 1).double(), one_by_one, atol=1e-7, rtol=0)
+def test_batch_dimensions_and_dtype_are_kept(chain, choice, rotations, sizes):
+    parameters, R = sizes(chain, 6), rotations(6)
+    k, m = parameters.shape[1], len(chain)
+    single, lead = chain.select(choice, parameters.float().reshape(2, 3, k), R.float().reshape(2, 3, 3, 3))
+    assert single.shape == (2, 3, m, 3) and lead.shape == (2, 3, m)
+    assert single.dtype == lead.dtype == torch.float32
+    one_by_one = [chain.select(choice, p, r) for p, r in zip(parameters, R, strict=True)]
+    torch.testing.assert_close(single.flatten(0, 1).double(), torch.stack([p for p, _ in one_by_one]), atol=1e-7, rtol=0)
+    torch.testing.assert_close(lead.flatten(0, 1).double(), torch.stack([q for _, q in one_by_one]), atol=1e-7, rtol=0)
 
 
-def test_the_mean_stands_where_several_keypoints_measure_one_parameter(cylinder):
-    keypoints = torch.tensor([[0, 0, 0.01], [0.005, 0, 0.01], [0, 0.014, 0]], dtype=torch.float64)
-    found = cylinder.parameters_from_keypoints(torch.zeros(3).double(), keypoints)
+def test_points_of_one_instance_share_its_template(chain, sizes):
+    """(4, m, 3) templates against (4, 5, 3) points, as the targets need them."""
+    template, points = chain.canonical(sizes(chain, 4)), random_points(20).reshape(4, 5, 3)
+    found, margin = chain.choose(NearestToPoint(points), template[:, None].expand(-1, 5, -1, -1))
+    assert found.shape == (4, 5, len(chain), 3)
+    for i, j in np.ndindex(4, 5):
+        alone, lead = chain.choose(NearestToPoint(points[i, j]), template[i])
+        torch.testing.assert_close(found[i, j], alone)
+        torch.testing.assert_close(margin[i, j], lead)
+
+
+def test_the_mean_stands_where_several_keypoints_measure_one_parameter():
+    keypoints = [
+        Keypoint("face", "centroid", Plane("z"), "h", 0.5),
+        Keypoint("rim", "face", Circle("z"), "r"),
+        Keypoint("side", "centroid", Cylinder("z"), "r", 2.0),
+    ]
+    chain = KeypointChain(keypoints, ["r", "h"], RevolutionSymmetry(rotoreflection=True))
+    assert chain.names == ["face", "side", "rim"]  # round by round of the selection
+    observed = torch.tensor([[0, 0, 0.01], [0, 0.014, 0], [0.005, 0, 0.01]], dtype=torch.float64)
+    found = chain.parameters_from_keypoints(torch.zeros(3).double(), observed)
     assert found.tolist() == pytest.approx([(0.005 + 0.014 / 2) / 2, 0.02])
 
 
-def test_the_default_choice_is_equation_1(part):
-    parameters, R, _ = random_instances(part, 20)
-    expected = part.chain.nearest_to_camera(parameters, R)
-    assert torch.equal(KeypointChoice().frame, torch.eye(3, dtype=torch.float64))
-    assert torch.equal(part.chain.select(KeypointChoice(), parameters, R), expected)
+def test_a_cone_is_measured_from_its_base():
+    """Base centre 3 below the centroid, radius 2, height 12: the rule breaks the apex angle in two."""
+    keypoints = [Keypoint("base", "centroid", Plane("-z", at=0)), *cone_keypoints("rim", "tip", "base", "z", "r", "h")]
+    chain = KeypointChain(
+        keypoints, ["r", "h"], RevolutionSymmetry(), None, lambda p: p[:, 1:] / 4 * np.array([[0, 0, 1]])
+    )
+    base, rim, tip = chain.canonical(torch.tensor([0.002, 0.012]).double())
+    assert base.tolist() == pytest.approx([0, 0, -0.003])
+    assert rim.norm().item() == pytest.approx(math.hypot(0.002, 0.003)) and rim[2] == base[2]
+    assert tip.tolist() == pytest.approx([0, 0, 0.009])
 
 
-@settings(max_examples=30, deadline=None)
-@given(st.tuples(*[st.floats(-10, 10)] * 3).filter(lambda d: math.hypot(*d) > 1e-3))
-def test_the_frame_of_a_choice_is_a_rotation_with_the_direction_as_z(direction):
-    frame = KeypointChoice(direction=direction).frame
-    torch.testing.assert_close(frame @ frame.T, torch.eye(3).double(), atol=1e-12, rtol=0)
-    assert float(torch.linalg.det(frame)) == pytest.approx(1)
-    along = torch.tensor(direction, dtype=torch.float64) / math.hypot(*direction)
-    torch.testing.assert_close(frame[2], along, atol=1e-12, rtol=0)
+def test_a_corner_stands_where_it_is_declared_less_the_centroid():
+    keypoints = [
+        Keypoint("corner", "centroid", Corner(("a / 2", 3, "-a"))),
+        Keypoint("foot", "centroid", Plane("-y", at=1)),
+        Keypoint("end", "centroid", Plane("x"), "a"),
+        Keypoint("top", "centroid", Plane("z"), "a"),
+    ]
+    chain = KeypointChain(keypoints, ["a"], cyclic(1), None, lambda p: np.tile([0.001, 0.002, 0.003], (len(p), 1)))
+    corner, foot, _, _ = chain.canonical(torch.tensor([[0.010], [0.020]]).double()).unbind(-2)
+    assert corner.flatten().tolist() == pytest.approx([0.004, 0.001, -0.013, 0.009, 0.001, -0.023])
+    assert foot.flatten().tolist() == pytest.approx([0, -0.003, 0] * 2)  # the plane y = -1 mm
 
 
-def test_an_oblique_choice_takes_what_lies_least_far_along_its_direction(tn06):
-    direction = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
-    parameters, R, _ = random_instances(tn06, 20)
-    found = tn06.chain.select(KeypointChoice(direction=(0.6, 0.0, 0.8)), parameters, R)
-    for (_, h, d), rotation, keypoints in zip(parameters, R, found, strict=True):
-        hexagon = d * tn06.chain.keypoints[2].orbit.directions
-        faces = torch.tensor([[0, 0, 0.5], [0, 0, -0.5]]).double() * h
-        along = [(points @ rotation.T @ direction).min() for points in (faces, hexagon)]
-        face, vertex = keypoints[0], keypoints[2] - keypoints[0]
-        assert float(rotation @ face @ direction) == pytest.approx(float(along[0]))
-        assert float(rotation @ vertex @ direction) == pytest.approx(float(along[1]))
+def test_the_canonical_labels_are_the_template_with_no_runner_up(chain, rotations, sizes):
+    parameters = sizes(chain, 4)
+    labels, margin = chain.select(KeypointChoice(KeypointRule.CANONICAL), parameters, rotations(4))
+    assert torch.equal(labels, chain.canonical(parameters)) and bool(margin.isinf().all())
 
 
-@pytest.mark.parametrize("direction", [(0.0, 0.0, 0.0), (0.0, 1.0)])
-def test_a_choice_without_a_direction_is_refused(direction):
-    with pytest.raises(ValueError, match=r"targets.direction is \(0.0, .*expected three numbers"):
-        KeypointChoice(direction=direction)
+def test_the_point_rule_asks_for_points(declare, rotations):
+    with pytest.raises(ValueError, match="the rule 'point' needs surface points"):
+        declare("nut").select(KeypointChoice(KeypointRule.POINT), NUT, rotations(1)[0])
 
 
-def test_the_unique_keypoints_do_not_depend_on_the_equivalent_pose_taken(part):
-    parameters, R, _ = random_instances(part, 20)
-    labels = part.chain.nearest_to_camera(parameters, R) @ R.mT
-    for G in symmetries(part):
-        turned = part.chain.nearest_to_camera(parameters, R @ G) @ (R @ G).mT
-        torch.testing.assert_close(turned, labels, atol=1e-12, rtol=0)
+def test_finite_labels_are_the_template_turned_and_seen_through_one_chirality(chain, rotations, sizes):
+    template = chain.canonical(sizes(chain, 60))[:, chain.is_finite]
+    labels, _ = chain.choose(NearestToCamera(rotations(60)), chain.canonical(sizes(chain, 60)))
+    turned = [
+        template @ (g @ chirality).T
+        for chirality in chain.chiralities
+        for g in chain.group
+        if torch.linalg.det(g) > 0
+    ]
+    gap = (torch.stack(turned) - labels[:, chain.is_finite]).flatten(2).norm(dim=-1)
+    assert gap.amin(0).max() < 1e-12
 
 
-def test_the_canonical_keypoints_do_depend_on_it(tn06):
-    parameters, R, _ = random_instances(tn06, 1)
-    G = tn06.symmetry.rotations[1]
-    vertex = tn06.chain.canonical(parameters)[0, 2]
-    assert torch.linalg.vector_norm(R[0] @ vertex - R[0] @ G @ vertex) > 0.9 * parameters[0, 2]
+@pytest.mark.parametrize(
+    ("name", "count"), [("nut", 1), ("nut with mirror", 1), ("wedge", 2), ("lug", 1), ("antiprism with inversion", 1)]
+)
+def test_a_mirror_makes_a_second_structure_only_where_it_moves_the_keypoints(declare, name, count):
+    """A nut's mirror does what its half turns do: its label keypoints lie in a mirror plane of the nut."""
+    chiralities = declare(name).chiralities
+    assert [round(float(torch.linalg.det(c))) for c in chiralities] == [1, -1][:count]
 
 
-def test_hole_and_vertex_stay_on_the_face_nearest_to_the_camera(tn06):
-    parameters, R, t = random_instances(tn06, 100)
-    keypoints = tn06.chain.nearest_to_camera(parameters, R)
-    heights = keypoints[..., 2]
-    assert torch.equal(heights[:, 0], heights[:, 1]) and torch.equal(heights[:, 0], heights[:, 2])
-    torch.testing.assert_close(heights[:, 0].abs(), parameters[:, 1] / 2)
-    depth = apply_pose(R, t, torch.stack([keypoints[:, 0], -keypoints[:, 0]], 1))[..., 2]
-    assert (depth[:, 0] < depth[:, 1]).all()
-    assert (heights[:, 0] > 0).any() and (heights[:, 0] < 0).any()
+def test_both_structures_of_a_wedge_are_labels(declare, rotations, sizes):
+    chain = declare("wedge")
+    template = chain.canonical(sizes(chain, 40))
+    labels, _ = chain.choose(NearestToCamera(rotations(40)), template)
+    sign = torch.linalg.det(labels[:, 1:]).sign() * torch.linalg.det(template[:, 1:]).sign()
+    assert set(sign.tolist()) == {1.0, -1.0}
 
 
-def test_each_unique_keypoint_is_the_nearest_of_its_equivalents(tn06):
-    """Brute force over both faces, 6 vertices and 720 points of the hole."""
-    (parameters, R, _), chain = random_instances(tn06, 10), tn06.chain
-    for (r, h, d), rotation, found in zip(parameters, R, chain.nearest_to_camera(parameters, R), strict=True):
-        side = min((1.0, -1.0), key=lambda s, z=rotation[2, 2]: s * z)
-        for radius, count, keypoint, gap in ((d, 6, found[2], 1e-12), (r, 720, found[1], 1e-6)):
-            turns = rotation_about_z(2 * math.pi / count * torch.arange(count).double())
-            ring = radius * turns[:, :, 0] + side * h / 2 * torch.tensor([0.0, 0, 1]).double()
-            assert abs((ring @ rotation[2]).min() - keypoint @ rotation[2]) <= gap
-
-
-def test_a_round_keypoint_seen_along_the_axis_goes_by_y(tn34):
-    parameters = torch.tensor([0.012, 0.010], dtype=torch.float64)
-    rim = tn34.chain.nearest_to_camera(parameters, NEAR_SIDE_UP)[2]
-    assert rim[:2].tolist() == [0, 0.012]
-
-
-def test_placing_like_an_observation_keeps_free_keypoints_and_resets_finite_ones(tn06):
-    parameters, R, _ = random_instances(tn06, 40)
-    observed = tn06.chain.nearest_to_camera(parameters, R)
-    placed = tn06.chain.place_like(parameters, observed)
-    canonical = tn06.chain.canonical(parameters)
+def test_placing_like_an_observation_keeps_free_keypoints_and_resets_finite_ones(declare, rotations, sizes):
+    chain = declare("nut")
+    parameters, R = sizes(chain, 40), rotations(40)
+    observed, _ = chain.choose(NearestToCamera(R), chain.canonical(parameters))
+    placed, canonical = chain.place_like(parameters, observed), chain.canonical(parameters)
     torch.testing.assert_close(placed[:, [0, 2]], canonical[:, [0, 2]])
     torch.testing.assert_close(placed[:, 1, :2], observed[:, 1, :2])
     torch.testing.assert_close(placed[:, 1, 2], canonical[:, 1, 2])
 
 
-def test_placing_like_exact_template_keypoints_gives_them_back(part):
-    parameters, _, _ = random_instances(part, 10)
-    canonical = part.chain.canonical(parameters)
-    torch.testing.assert_close(part.chain.place_like(parameters, canonical), canonical)
+def test_placing_like_exact_template_keypoints_gives_them_back(chain, sizes):
+    parameters = sizes(chain, 10)
+    canonical = chain.canonical(parameters)
+    torch.testing.assert_close(chain.place_like(parameters, canonical), canonical)
 
 
-def test_placing_uses_the_given_parameters_not_the_observed_distances(tn34):
-    parameters = torch.tensor([0.012, 0.010], dtype=torch.float64)
-    noisy = tn34.chain.canonical(1.2 * parameters)
-    torch.testing.assert_close(tn34.chain.place_like(parameters, noisy), tn34.chain.canonical(parameters))
+def test_placing_uses_the_given_parameters_not_the_observed_distances(chain, sizes):
+    parameters = sizes(chain, 10)
+    placed = chain.place_like(parameters, chain.canonical(1.2 * parameters))
+    torch.testing.assert_close(placed, chain.canonical(parameters))
 
 
-def test_a_keypoint_on_a_ring_is_not_finite_nor_is_one_that_hangs_on_it():
-    keypoints = [
-        Keypoint("face", "centroid", point_orbit((0, 0, 1)), "h"),
-        Keypoint("rim", "face", RingOrbit(), "r"),
-        Keypoint("foot", "rim", point_orbit((0, 0, -1)), "h"),
-        Keypoint("corner", "face", polygon_orbit(4), "r"),
+def test_a_free_keypoint_observed_on_its_axis_stays_where_the_template_has_it(declare):
+    observed = torch.tensor([[0, 0, -0.02], [0, 0, -0.02]], dtype=torch.float64)
+    placed = declare("flange").place_like(torch.tensor([0.01, 0.02]).double(), observed)
+    assert placed.flatten().tolist() == pytest.approx([0, 0, -0.02, 0.01, 0, -0.02])
+
+
+def test_turning_back_undoes_every_free_choice(chain, rotations, sizes):
+    """Labels turned back are, step by step, the template's steps under one symmetry's fixed share."""
+    template = chain.canonical(sizes(chain, 30))
+    labels, _ = chain.choose(NearestToCamera(rotations(30)), template)
+    back = chain.turn_back(labels)
+    torch.testing.assert_close(chain.turn_back(back), back, atol=1e-15, rtol=1e-9)
+    torch.testing.assert_close(chain.steps(back).norm(dim=-1), chain.steps(template).norm(dim=-1))
+    torch.testing.assert_close(chain.turn_back(template), template, atol=1e-15, rtol=1e-9)
+    if chain.names in (["end", "rim"], ["skin"]):  # nothing but the free choice was made
+        torch.testing.assert_close(back, template, atol=1e-15, rtol=1e-9)
+
+
+def test_turning_back_keeps_a_nuts_side_and_vertex(declare):
+    labels = torch.tensor([[0, 0, -0.005], [-0.0024, 0.0032, -0.005], [-0.012, 0, -0.005]], dtype=torch.float64)
+    back = declare("nut").turn_back(labels)
+    assert torch.equal(back[[0, 2]], labels[[0, 2]])
+    assert back[1].tolist() == pytest.approx([0.004, 0, -0.005])
+
+
+def test_a_keypoint_on_a_circle_is_not_finite_nor_is_one_that_hangs_on_it(declare):
+    chain = declare("lug")
+    assert dict(zip(chain.names, chain.is_finite, strict=True)) == {
+        "lid": True,
+        "eye": True,
+        "rim": False,
+        "floor": False,
+    }
+
+
+def test_keypoints_may_be_declared_in_any_order():
+    declared = [
+        Keypoint("rim", "top", Circle("z"), "r"),
+        Keypoint("top", "base", Plane("z"), "h"),
+        Keypoint("base", "centroid", Plane("-z", at=5)),
     ]
-    assert KeypointChain(keypoints, ["r", "h"]).is_finite == [True, False, False, True]
+    assert [keypoint.name for keypoint in select_keypoints(declared, ["r", "h"])] == ["base", "top", "rim"]
+    chain = KeypointChain(declared, ["r", "h"], RevolutionSymmetry())
+    assert chain.reference == [0, 1, 2] and len(chain) == 3
 
 
-def test_the_names_come_in_order(tn06):
-    assert tn06.chain.names == ["face", "hole", "vertex"]
-    assert len(tn06.chain) == 3
+def test_a_sphere_has_one_keypoint_and_one_parameter(rotations):
+    chain = KeypointChain([Keypoint("skin", "centroid", Sphere(), "r")], ["r"], SphericalSymmetry())
+    R = rotations(5)
+    labels, margin = chain.choose(NearestToCamera(R), chain.canonical(torch.full((5, 1), 0.01).double()))
+    torch.testing.assert_close((labels @ R.mT)[:, 0], torch.tensor([[0, 0, -0.01]]).double().expand(5, 3))
+    torch.testing.assert_close(margin, torch.full((5, 1), 0.01).double())
 
 
-def test_an_unknown_reference_is_named():
-    with pytest.raises(ValueError, match=r"'rim' refers to 'face', which is not one of \['centroid'\]"):
-        KeypointChain([Keypoint("rim", "face", RingOrbit(), "r")], ["r"])
-
-
-def test_a_keypoint_cannot_refer_to_a_later_one():
-    later = [
-        Keypoint("rim", "face", RingOrbit(), "r"),
-        Keypoint("face", "centroid", point_orbit((0, 0, 1)), "h"),
-    ]
-    with pytest.raises(ValueError, match="earlier keypoint"):
-        KeypointChain(later, ["r", "h"])
-
-
-def test_an_unknown_parameter_is_named():
-    with pytest.raises(ValueError, match=r"'rim' measures 'q', which is not one of the parameters \['r'\]"):
-        KeypointChain([Keypoint("rim", "centroid", RingOrbit(), "q")], ["r"])
-
-
-def test_a_parameter_that_no_keypoint_measures_is_named():
-    with pytest.raises(ValueError, match="no keypoint determines the parameter 'h'"):
-        KeypointChain([Keypoint("rim", "centroid", RingOrbit(), "r")], ["r", "h"])
+def test_a_mirror_that_fits_no_symmetry_is_refused(declare):
+    with pytest.raises(ValueError, match="not a group together"):
+        KeypointChain(declare("nut").keypoints, "rhd", dihedral(6), reflection((1, 0.2, 0)))
+    with pytest.raises(ValueError, match="leave it out"):
+        KeypointChain(declare("flange").keypoints, "rh", RevolutionSymmetry(), reflection((1, 0, 0)))

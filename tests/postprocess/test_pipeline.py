@@ -6,15 +6,18 @@ import pytest
 import torch
 
 from pnet.data.targets import point_labels
-from pnet.parts.keypoints import KeypointChoice
+from pnet.parts.choice import KeypointChoice, KeypointRule
 from pnet.postprocess.cluster import CentroidClusters
+from pnet.postprocess.folded_vote import FoldedVote
 from pnet.postprocess.pipeline import PoseRecovery, best_first, no_detections
 from pnet.postprocess.radius_filter import RadiusFilter
+from pnet.postprocess.vote import MeanVote
 from pnet.records import Detections, PointPrediction, Scene
 
 RECOVERY = PoseRecovery(
     CentroidClusters(0.01, 5, 10),
     RadiusFilter(0.01, 5, 0.002, 0.02, 0.1),
+    MeanVote(),
     visibility_threshold=0.0,
     scene_parameters=False,
     best_visible=0.9,
@@ -22,9 +25,16 @@ RECOVERY = PoseRecovery(
 )
 
 
-def predict(scene: Scene, part, noise: float = 0.0, visibility: bool = True) -> PointPrediction:
+FOLDED = {"voting": FoldedVote(96, 512, 25.0, 3.0), "radius_filter": None}
+UPRIGHT = KeypointChoice(direction=(0, 1, 0))
+POINT = KeypointChoice(KeypointRule.POINT)
+
+
+def predict(
+    scene: Scene, part, noise: float = 0.0, visibility: bool = True, choice: KeypointChoice = UPRIGHT
+) -> PointPrediction:
     """A network that knows the labels up to noise; scene 1 of a batch of two."""
-    labels = point_labels(scene, part.chain, KeypointChoice(direction=(0, 1, 0)))
+    labels = point_labels(scene, part.chain, choice)
     generator = torch.Generator().manual_seed(0)
 
     def batch(value):
@@ -74,6 +84,28 @@ def test_noise_of_half_a_millimetre_averages_out(part, make_scene, seed, trust):
     assert len(found.score) == 7 and len(set(nearest.tolist())) == 7
     assert float(distance.max()) < part.pose_space(scene.parameters[0]).distance_threshold / 2
     assert float((found.parameters[nearest] - torch.from_numpy(scene.parameters)).abs().max()) < 0.0005
+
+
+@pytest.mark.parametrize("choice", [UPRIGHT, POINT], ids=["camera", "point"])
+@pytest.mark.parametrize("noise", [0.0, 0.0005])
+@pytest.mark.parametrize("trust", [None, 0.001])
+def test_folded_votes_give_every_instance_under_either_rule(any_part, make_scene, choice, noise, trust):
+    scene = make_scene(any_part, bodies=6, points=1200)
+    found = recover(any_part, scene, predict(scene, any_part, noise, choice=choice), **FOLDED, trust=trust)
+    distance, nearest = paired(any_part, scene, found)
+    assert len(found.score) == 6 and sorted(nearest.tolist()) == list(range(6))
+    assert float(distance.max()) < 1e-6 + noise
+    sizes = torch.from_numpy(scene.parameters)
+    torch.testing.assert_close(found.parameters[nearest], sizes, rtol=0, atol=1e-6 + noise / 2)
+
+
+def test_plain_means_cannot_read_labels_of_the_rule_point(tn06, make_scene):
+    scene = make_scene(tn06, bodies=6, points=1200)
+    prediction = predict(scene, tn06, choice=POINT)
+    threshold = tn06.pose_space(scene.parameters[0]).distance_threshold
+    plain = paired(tn06, scene, recover(tn06, scene, prediction, radius_filter=None))[0]
+    folded = paired(tn06, scene, recover(tn06, scene, prediction, **FOLDED))[0]
+    assert float(folded.max()) < 1e-6 and float(plain.max()) > threshold / 2
 
 
 def test_without_the_radius_filter_every_vote_counts(tn34, make_scene):

@@ -1,5 +1,7 @@
 """Build objects from configs, from an allowlist only: a config file is data, not code."""
 
+import os
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -21,6 +23,7 @@ ALLOWED = (
     "pnet.engine.schedules.",
     "torch.optim.",
 )
+TRUSTED = "PNET_TRUSTED"  # environment: modules of the user's own that configs may build from, with commas
 
 
 def instantiate(node: DictConfig, *args: Any, **kwargs: Any) -> Any:
@@ -34,10 +37,26 @@ def instantiate(node: DictConfig, *args: Any, **kwargs: Any) -> Any:
     return hydra.utils.instantiate(node, *args, _convert_="all", **kwargs)
 
 
+def allowed() -> tuple[str, ...]:
+    """The prefixes that targets may have: pnet's own, and modules that the user names in the environment.
+
+    A config cannot extend it: whoever starts the command decides whose code runs. Such modules are also looked for in
+    the working directory.
+    """
+    named = [word.strip() for word in os.environ.get(TRUSTED, "").split(",") if word.strip()]
+    if named and os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+    return (*ALLOWED, *(f"{name.removesuffix('.')}." for name in named))
+
+
 def _check(key: str, target: str) -> None:
     where = f"{key or 'config'}._target_: {target}"
-    if not target.startswith(ALLOWED):
-        raise ValueError(f"{where} is not allowed; pnet builds only from {', '.join(ALLOWED)}")
+    prefixes = allowed()
+    if not target.startswith(prefixes):
+        raise ValueError(
+            f"{where} is not allowed; pnet builds only from {', '.join(prefixes)}; "
+            f"name a module of your own in the environment variable {TRUSTED}"
+        )
     try:
         found = get_object(target)
     except Exception as fault:
@@ -45,7 +64,7 @@ def _check(key: str, target: str) -> None:
     # a name that is only imported there may be anything: judge the object by where it was defined;
     # classes only: their constructors hold values, a function could act
     home = f"{getattr(found, '__module__', '')}.{getattr(found, '__qualname__', '')}"
-    if not isinstance(found, type) or not home.startswith(ALLOWED):
+    if not isinstance(found, type) or not home.startswith(prefixes):
         raise ValueError(f"{where} is {home}, which is not allowed")
 
 

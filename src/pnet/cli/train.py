@@ -207,7 +207,7 @@ def log_settings(trainer: "lightning.Trainer", cfg: DictConfig, metrics: dict[st
         "lr": cfg.optimizer.lr,
         "batch_size": cfg.data.batch_size,
         "steps": cfg.trainer.steps,
-        "geometric_unique": cfg.data.targets.geometric_unique,
+        "keypoint_rule": cfg.data.targets.rule,
         "seed": cfg.seed,
     }
     scores = {

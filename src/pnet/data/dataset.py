@@ -11,7 +11,8 @@ from torch.utils.data import Dataset, Sampler
 from pnet.data.augmentation import Augmentation
 from pnet.data.scene_folder import SceneFolder
 from pnet.data.targets import point_labels
-from pnet.parts.keypoints import KeypointChain, KeypointChoice
+from pnet.parts.choice import KeypointChoice
+from pnet.parts.keypoints import KeypointChain
 from pnet.records import Batch, Scene
 
 Draw = tuple[int, int]  # scene index and epoch: all that chance depends on, besides the seed

@@ -13,7 +13,7 @@ from pnet.data.augmentation import Augmentation
 from pnet.data.dataset import EpochSampler, LabelledScenes, collate
 from pnet.data.scene_folder import SceneFolder
 from pnet.parts.base import ParametricPart
-from pnet.parts.keypoints import KeypointChoice, KeypointRule
+from pnet.parts.choice import KeypointChoice, KeypointRule
 
 
 @dataclass(frozen=True)
@@ -21,19 +21,21 @@ class Targets:
     """How labels are made.
 
     Attributes:
-        geometric_unique: GU, equation 1; False is the ablation "w/o GU".
-        direction: see `KeypointChoice`; the paper's is (0, 0, 1).
+        rule: which of the equivalent keypoints is the label: "camera" (GU, equation 1), "canonical" (the
+            ablation "w/o GU") or "point" (nearest to the surface point; needs `FoldedVote`).
+        direction: of the camera rule, see `KeypointChoice`; the paper's is (0, 0, 1).
     """
 
-    geometric_unique: bool = True
+    rule: str = "camera"
     direction: Sequence[float] = (0.0, 0.0, 1.0)
 
     @property
     def choice(self) -> KeypointChoice:
         """Which equivalent keypoint is the label."""
-        rule = KeypointRule.CAMERA if self.geometric_unique else KeypointRule.CANONICAL
+        if self.rule not in list(KeypointRule):
+            raise ValueError(f"data.targets.rule is {self.rule!r}, choose {', '.join(KeypointRule)}")
         x, y, z = self.direction if len(self.direction) == 3 else (0, 0, 0)
-        return KeypointChoice(rule, (x, y, z))
+        return KeypointChoice(KeypointRule(self.rule), (x, y, z))
 
 
 class SceneDataModule(lightning.LightningDataModule):

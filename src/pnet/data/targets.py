@@ -3,22 +3,39 @@
 import torch
 from torch import Tensor
 
-from pnet.geometry.rigid import apply_pose
-from pnet.parts.keypoints import KeypointChain, KeypointChoice
+from pnet.geometry.rigid import apply_inverse_pose, apply_pose
+from pnet.parts.choice import KeypointChoice, KeypointRule, NearestToPoint
+from pnet.parts.keypoints import KeypointChain
 from pnet.records import Scene
 
 
-def instance_keypoints(scene: Scene, chain: KeypointChain, choice: KeypointChoice) -> Tensor:
-    """Label keypoints of every instance.
+def instance_keypoints(scene: Scene, chain: KeypointChain, choice: KeypointChoice) -> tuple[Tensor, Tensor]:
+    """Label keypoints of every instance, under a rule that looks at the instance alone.
 
     Args:
-        scene: d instances. chain: the part's keypoints. choice: which equivalent is the label.
+        scene: d instances. chain: the part's keypoints. choice: the camera or the canonical rule.
     Returns:
-        (d, m, 3) float64, camera frame, metres.
+        keypoints (d, m, 3) float64, camera frame, metres; margin (d, m) to the runner-up, metres.
     """
     R, t = torch.from_numpy(scene.R), torch.from_numpy(scene.t)
-    local = chain.select(choice, torch.from_numpy(scene.parameters), R)
-    return apply_pose(R, t, local)
+    local, margin = chain.select(choice, torch.from_numpy(scene.parameters), R)
+    return apply_pose(R, t, local), margin
+
+
+def nearest_keypoints(scene: Scene, chain: KeypointChain) -> tuple[Tensor, Tensor]:
+    """For every surface point the equivalent keypoints of its instance that are nearest to it (`KeypointRule.POINT`).
+
+    Args:
+        scene: N points on d instances. chain: the part's keypoints.
+    Returns:
+        keypoints (N, m, 3) float64, camera frame, metres; margin (N, m) to the runner-up, metres.
+    """
+    owner = torch.from_numpy(scene.instance)
+    R, t = torch.from_numpy(scene.R)[owner], torch.from_numpy(scene.t)[owner]
+    points = apply_inverse_pose(R, t, torch.from_numpy(scene.points).double()[:, None])[:, 0]
+    template = chain.canonical(torch.from_numpy(scene.parameters))[owner]
+    local, margin = chain.choose(NearestToPoint(points), template)
+    return apply_pose(R, t, local), margin
 
 
 def point_labels(scene: Scene, chain: KeypointChain, choice: KeypointChoice) -> dict[str, Tensor]:
@@ -27,17 +44,21 @@ def point_labels(scene: Scene, chain: KeypointChain, choice: KeypointChoice) -> 
     Args:
         scene: N points on d instances; every point lies on one.
     Returns:
-        float32 tensors: points (N, 3), centroid (N, 3), keypoints (N, m, 3), parameters (N, k) in
-        metres, visibility (N,).
+        float32 tensors: points (N, 3), centroid (N, 3), keypoints (N, m, 3), margin (N, m), parameters (N, k)
+        in metres, visibility (N,).
     """
     owner = torch.from_numpy(scene.instance)
     if len(owner) and (int(owner.min()) < 0 or int(owner.max()) >= len(scene.R)):
         raise ValueError(f"{scene.id}: a point names instance {int(owner.max())} of {len(scene.R)}")
+    if choice.rule is KeypointRule.POINT:
+        keypoints, margin = nearest_keypoints(scene, chain)
+    else:
+        keypoints, margin = (value[owner] for value in instance_keypoints(scene, chain, choice))
     per_instance = {
         "centroid": torch.from_numpy(scene.t),
-        "keypoints": instance_keypoints(scene, chain, choice),
         "parameters": torch.from_numpy(scene.parameters),
         "visibility": torch.from_numpy(scene.visibility),
     }
     labels = {name: value.float()[owner] for name, value in per_instance.items()}
-    return {"points": torch.from_numpy(scene.points), **labels}
+    points = torch.from_numpy(scene.points)
+    return {"points": points, "keypoints": keypoints.float(), "margin": margin.float(), **labels}

@@ -47,6 +47,8 @@ class PoseTraining(lightning.LightningModule):
         """Loss of a batch; each module's own is logged."""
         losses = self._losses(batch)
         self._log("train", losses, len(batch.points))
+        for name, share in self.loss.ambiguity(batch).items():
+            self.log(f"ambiguous_labels/{name}", share, batch_size=len(batch.points))
         return losses["loss"]
 
     def validation_step(self, batch: Batch, index: int) -> None:

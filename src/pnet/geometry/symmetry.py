@@ -73,3 +73,80 @@ def dihedral(n: int) -> FiniteSymmetry:
     turns = cyclic(n).rotations
     flip = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
     return FiniteSymmetry(torch.cat([turns, turns @ flip]))
+
+
+FLIP = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))  # half turn about x
+
+
+def reflection(normal: tuple[float, float, float]) -> Tensor:
+    """(3, 3) float64: mirror in the plane through the origin with this normal."""
+    n = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
+    return torch.eye(3, dtype=torch.float64) - 2 * torch.outer(n, n)
+
+
+def full_group(symmetry: Symmetry, mirror: Tensor | None = None) -> Tensor:
+    """Every symmetry of a body, reflections too, up to turns about a revolution's axis or a sphere's centre.
+
+    Args:
+        symmetry: the proper ones. mirror: (3, 3) one improper symmetry, or None where there is none. A
+            revolution's and a sphere's need not be named: together with the turns they move no point that
+            the proper ones do not move there.
+    Returns:
+        (g, 3, 3) float64, the identity first, proper before improper.
+    """
+    eye = torch.eye(3, dtype=torch.float64)
+    match symmetry:
+        case FiniteSymmetry(rotations=G):
+            return G if mirror is None else torch.cat([G, _mirrored(G, mirror)])
+        case RevolutionSymmetry(rotoreflection=True):
+            group = torch.stack([eye, torch.tensor(FLIP, dtype=torch.float64)])
+        case _:
+            group = eye[None]
+    if mirror is not None:
+        raise ValueError("a mirror adds nothing to a revolution or a sphere: leave it out")
+    return group
+
+
+def _mirrored(G: Tensor, mirror: Tensor) -> Tensor:
+    M = mirror.to(G)
+    if M.shape != (3, 3) or not torch.allclose(M @ M.mT, torch.eye(3).to(G)) or torch.linalg.det(M) > 0:
+        raise ValueError("the mirror must be an orthonormal (3, 3) matrix with determinant -1")
+    whole = torch.cat([G, G @ M])
+    products = (whole[:, None] @ whole[None]).flatten(0, 1)
+    gap = (products[:, None] - whole[None]).abs().amax((-1, -2)).amin(1)
+    if bool((gap > 1e-5).any()):
+        raise ValueError("the mirror and the symmetry's rotations are not a group together")
+    return G @ M
+
+
+def nearest_equivalent(R: Tensor, reference: Tensor, symmetry: Symmetry) -> Tensor:
+    """Of the equivalent rotations R g the one nearest to a reference.
+
+    Args:
+        R, reference: (..., 3, 3) part → camera, broadcast against each other.
+        symmetry: the part's proper group.
+    Returns:
+        (..., 3, 3) R g with the smallest angle to the reference.
+    """
+    R, reference = torch.broadcast_tensors(R, reference)
+    match symmetry:
+        case FiniteSymmetry(rotations=rotations):
+            G = rotations.to(R)
+            closeness = (R.mT @ reference).flatten(-2) @ G.flatten(-2).mT  # trace(referenceᵀ R g)
+            return R @ G[closeness.argmax(-1)]
+        case RevolutionSymmetry(rotoreflection=reflected):
+            turned = _turn_nearest(R, reference)
+            if not reflected:
+                return turned
+            flipped = _turn_nearest(R @ torch.tensor(FLIP).to(R), reference)
+            nearer = (flipped[..., 2] * reference[..., 2]).sum(-1) > (turned[..., 2] * reference[..., 2]).sum(-1)
+            return torch.where(nearer[..., None, None], flipped, turned)
+        case _:
+            return reference
+
+
+def _turn_nearest(R: Tensor, reference: Tensor) -> Tensor:
+    """R turned about its own z to come nearest to the reference: maximise trace(referenceᵀ R Rz(φ))."""
+    A = reference.mT @ R
+    angle = torch.atan2(A[..., 0, 1] - A[..., 1, 0], A[..., 0, 0] + A[..., 1, 1])
+    return R @ rotation_about_z(angle)

@@ -9,6 +9,9 @@ from pnet.parts.keypoints import KeypointChain
 from pnet.records import Batch, PointPrediction
 
 
+AMBIGUOUS = 1e-3  # metres: a label whose runner-up is nearer than this may well have been the other one
+
+
 class Norm(StrEnum):
     """How an error vector becomes a number."""
 
@@ -23,6 +26,8 @@ class ParametricLoss:
     Args:
         chain: the part's keypoints, for M_P.
         norm: for centroids and keypoints.
+        margin: metres; a keypoint label that is no better than its runner-up by much more than this counts less, by
+            margin_of_label / (margin_of_label + margin). None: every label counts alike.
         centroid, keypoints, parameters, visibility: the weights λ; None takes the paper's default,
             λ_MC = 200, λ_MKP = 200 / 3m, λ_MP = 50 / k, λ_MV = 50.
     """
@@ -31,13 +36,16 @@ class ParametricLoss:
         self,
         chain: KeypointChain,
         norm: str,
+        margin: float | None = None,
         centroid: float | None = None,
         keypoints: float | None = None,
         parameters: float | None = None,
         visibility: float | None = None,
     ) -> None:
         m, k = len(chain), len(chain.parameters)
-        self._chain, self._norm = chain, Norm(norm)
+        if margin is not None and margin <= 0:
+            raise ValueError(f"loss.margin is {margin}, expected a positive length in metres or null")
+        self._chain, self._norm, self._margin = chain, Norm(norm), margin
         given = {
             "centroid": (centroid, 200.0),
             "keypoints": (keypoints, 200.0 / (3 * m)),
@@ -55,7 +63,7 @@ class ParametricLoss:
         parameters = self._chain.parameters_from_keypoints(predicted.centroid, predicted.keypoints)
         losses = {
             "centroid": self._length(predicted.centroid - batch.centroid),
-            "keypoints": self._keypoints(predicted.keypoints - batch.keypoints),
+            "keypoints": self._keypoints(predicted.keypoints - batch.keypoints, batch.margin),
             "parameters": (parameters - batch.parameters).abs().sum(-1).mean(),
         }
         if predicted.visibility is not None:
@@ -63,13 +71,24 @@ class ParametricLoss:
         total = torch.stack([self.weights[name] * loss for name, loss in losses.items()]).sum()
         return {"loss": total, **losses}
 
-    def _keypoints(self, error: Tensor) -> Tensor:
+    def ambiguity(self, batch: Batch) -> dict[str, Tensor]:
+        """Keypoint name → share of its labels whose runner-up is less than `AMBIGUOUS` worse."""
+        share = (batch.margin < AMBIGUOUS).float().mean((0, 1))
+        return dict(zip(self._chain.names, share.unbind(), strict=True))
+
+    def _keypoints(self, error: Tensor, margin: Tensor) -> Tensor:
+        squared = error.square().sum(-1)
+        if self._margin is not None:
+            trust = 1 / (1 + self._margin / margin)
+            squared = squared * (trust.square() if self._norm is Norm.EACH else trust)
         if self._norm is Norm.EACH:
-            return self._length(error) * error.shape[-2]
-        return self._length(error.flatten(-2))
+            return self._mean(squared) * error.shape[-2]
+        return self._mean(squared.sum(-1))
 
     def _length(self, error: Tensor) -> Tensor:
-        squared = error.square().sum(-1)
+        return self._mean(error.square().sum(-1))
+
+    def _mean(self, squared: Tensor) -> Tensor:
         if self._norm is Norm.SQUARED:
             return squared.mean()
         # the root's slope is infinite at zero: a nanometre of slack keeps it finite

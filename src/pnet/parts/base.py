@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import product
 
 import numpy as np
@@ -14,21 +14,24 @@ from torch import Tensor
 from pnet.geometry.pose_space import PoseSpace
 from pnet.geometry.symmetry import FiniteSymmetry, Symmetry
 from pnet.parts.keypoints import Keypoint, KeypointChain
+from pnet.parts.solids import Shape, Solid, solid
 
 Points = NDArray[np.float64]
+Grid = Mapping[str, Sequence[float]]
 
 
 class ParametricPart(ABC):
     """A shape template; a part object is the template with parameter values.
 
-    The part frame has its origin at the volume centroid, metres. A subclass declares the class
-    attributes and the two solids; grids come from its config.
+    A subclass declares the class attributes and the solid; everything else follows. The solid may be built about
+    any origin (the frame of construction); the part frame has the same axes and its origin at the volume centroid.
 
     Attributes:
         name: the template's name. parameter_names: (k) in the order of every parameter array.
         keypoints: the declaration from which labels, parameters and the fit follow.
-        symmetry: proper rotations that leave the part unchanged.
-        mirror: (3, 3) an improper symmetry that turns the label keypoints into the other chirality, or None.
+        symmetry: proper rotations that leave the part unchanged; a revolution's axis is z.
+        mirror: (3, 3) an improper symmetry, or None; only where no proper one does the same to the keypoints.
+        is_fixed: all bodies have the same, known sizes, so estimates take them from the part.
     """
 
     name: str
@@ -36,35 +39,72 @@ class ParametricPart(ABC):
     keypoints: tuple[Keypoint, ...]
     symmetry: Symmetry
     mirror: Tensor | None = None
+    is_fixed: bool = False
 
     def __init__(
         self,
-        learning: Mapping[str, Sequence[float]],
-        generalization: Mapping[str, Sequence[float]],
+        learning: Grid,
+        generalization: Grid | None = None,
         sections: int = 48,
     ) -> None:
         """
         Args:
             learning: parameter → values in mm; all combinations are the part objects of the training
-                set and of the L-dataset. generalization: the same for the G-dataset.
+                set and of the L-dataset. generalization: the same for the G-dataset; None where there is none.
             sections: polygon sides that stand for a circle in the mesh.
         """
         if sections < 6 or sections % 6:
             raise ValueError(f"{self.name}: sections is {sections}, expected a multiple of 6")
         self.sections = sections
-        self.chain = KeypointChain(self.keypoints, self.parameter_names)
         self.grids = {"L": self._grid("learning", learning)}
-        self.grids["G"] = self._grid("generalization", generalization)
+        if generalization is not None:
+            self.grids["G"] = self._grid("generalization", generalization)
+        for grid in self.grids.values():
+            self._check_grid(grid)
+        try:
+            self.chain = KeypointChain(
+                self.keypoints,
+                self.parameter_names,
+                self.symmetry,
+                self.mirror,
+                self.centroid,
+                typical=self.grids["L"][0],
+            )
+        except ValueError as fault:
+            raise ValueError(f"{self.name}: {fault}") from fault
 
     @abstractmethod
+    def solid(self, parameters: Points) -> Solid | Shape:
+        """The solid in the frame of construction, out of `pnet.parts.solids`.
+
+        Args:
+            parameters: (..., k) metres. Write it with broadcasting in mind: unpack with
+                `r, h = self.split(parameters)`, each (...).
+        """
+
     def check(self, parameters: Points) -> None:
-        """Raise ValueError where values make no valid solid. parameters: (k,) metres."""
+        """Raise ValueError where values make no valid solid, with the reason. parameters: (k,) metres."""
 
-    @abstractmethod
+    def split(self, parameters: Points) -> list[Points]:
+        """(..., k) → k arrays (...)."""
+        return list(np.moveaxis(np.asarray(parameters, float), -1, 0))
+
     def mesh(self, parameters: Points) -> trimesh.Trimesh:
-        """The watertight solid, faces wound outwards, in the part frame. parameters: (k,) metres."""
+        """The watertight solid, faces wound outwards, in the part frame. parameters: (k,) metres.
 
-    @abstractmethod
+        Raises:
+            ValueError: where it vanishes or falls apart.
+        """
+        mesh = solid(self.solid(parameters)).mesh(self.sections)
+        if len(mesh.faces) == 0 or mesh.volume <= 0:
+            raise ValueError(f"{self.name}: nothing is left of the solid with {self.text(parameters)}")
+        if mesh.body_count > 1:
+            raise ValueError(
+                f"{self.name}: the solid falls into {mesh.body_count} pieces with {self.text(parameters)}; a cut goes "
+                "through it, or added shapes don't touch"
+            )
+        return mesh.apply_translation(-self.centroid(parameters[None])[0])
+
     def convex_pieces(self, parameters: Points, fill_holes: bool) -> list[Points]:
         """Corner points of convex pieces for collision, in the part frame.
 
@@ -74,6 +114,37 @@ class ParametricPart(ABC):
         Returns:
             Arrays (n_i, 3), metres; the union of their hulls is the solid (with or without its holes).
         """
+        centroid = self.centroid(parameters[None])[0]
+        pieces = solid(self.solid(parameters)).pieces(self.sections, fill_holes)
+        return [piece - centroid for piece in pieces]
+
+    def centroid(self, parameters: Points) -> Points:
+        """Volume centroid in the frame of construction.
+
+        Args:
+            parameters: (n, k) metres.
+        Returns:
+            (n, 3) metres: of the mesh's polyhedron, exactly; in closed form where shapes neither overlap nor are
+            cut beyond their borders, else from the mesh.
+        """
+        if not self._in_closed_form:
+            return np.stack([self._mesh_centroid(tuple(row)) for row in parameters.tolist()])
+        volume, moment = solid(self.solid(parameters)).signed_volume_and_moment(self.sections)
+        centroid = moment / volume[..., None]
+        return np.broadcast_to(centroid, (len(parameters), 3))
+
+    @cached_property
+    def _in_closed_form(self) -> bool:
+        for row in self.grids["L"][[0, -1]]:
+            body = solid(self.solid(row))
+            volume, _ = body.signed_volume_and_moment(self.sections)
+            if abs(float(volume) / body.mesh(self.sections).volume - 1) > 1e-6:
+                return False
+        return True
+
+    @lru_cache(maxsize=4096)  # noqa: B019  a part lives as long as its process
+    def _mesh_centroid(self, parameters: tuple[float, ...]) -> Points:
+        return np.asarray(solid(self.solid(np.array(parameters))).mesh(self.sections).center_mass)
 
     def part_object(self, grid: str, index: int) -> Points:
         """Parameters of a part object.
@@ -84,7 +155,7 @@ class ParametricPart(ABC):
             (k,) metres.
         """
         if grid not in self.grids:
-            raise ValueError(f"{self.name} has no grid {grid!r}: choose L or G")
+            raise ValueError(f"{self.name} has no grid {grid!r}: choose {' or '.join(self.grids)}")
         values = self.grids[grid]
         if not 0 <= index < len(values):
             raise ValueError(
@@ -118,7 +189,19 @@ class ParametricPart(ABC):
         pairs = zip(self.parameter_names, parameters, strict=True)
         return ", ".join(f"{name} = {1000 * value:g} mm" for name, value in pairs)
 
-    def _grid(self, key: str, values: Mapping[str, Sequence[float]]) -> Points:
+    def _check_grid(self, grid: Points) -> None:
+        """Valid values, and shapes that don't turn inside out; all part objects at once."""
+        for parameters in grid:
+            self.check_named(parameters)
+        for _, shape in solid(self.solid(grid)).steps:
+            volume = np.broadcast_to(shape.volume_and_moment(self.sections)[0], len(grid))
+            if (volume <= 0).any():
+                text = self.text(grid[int(volume.argmin())])
+                raise ValueError(
+                    f"{self.name}: a {type(shape).__name__.lower()} of the solid vanishes or turns inside out with {text}"
+                )
+
+    def _grid(self, key: str, values: Grid) -> Points:
         if set(values) != set(self.parameter_names):
             raise ValueError(
                 f"part.{key} names {sorted(values)}, {self.name} has {sorted(self.parameter_names)}"
@@ -127,10 +210,7 @@ class ParametricPart(ABC):
             if isinstance(column, (str, int, float)) or not len(column):
                 raise ValueError(f"part.{key}.{name} is {column!r}, expected a list of values in mm")
         axes = [values[name] for name in reversed(self.parameter_names)]
-        grid = np.array([combination[::-1] for combination in product(*axes)], float) / 1000
-        for parameters in grid:
-            self.check_named(parameters)
-        return grid
+        return np.array([combination[::-1] for combination in product(*axes)], float) / 1000
 
 
 def pose_space_of_mesh(mesh: trimesh.Trimesh, symmetry: Symmetry) -> PoseSpace:

@@ -1,106 +1,129 @@
-"""Keypoints from parameters and back, from one declaration (Section II.A of the paper).
+"""Keypoints from parameters and back, from one declaration (Section II.A of the paper)."""
 
-The selection loop: the centroid is the first reference; each rule measures one distance from its
-reference to a primitive, where the next keypoint lies; a found keypoint may be a later reference.
-"""
-
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
-from math import isfinite
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from pnet.parts.orbits import FiniteOrbit, Orbit
+from pnet.geometry.symmetry import Symmetry, full_group
+from pnet.parts.choice import Judge, KeypointChoice, KeypointRule, NearestToCamera, first_by
+from pnet.parts.declaration import check_declaration, check_names
+from pnet.parts.equivalents import allowed, along_and_radial, distinct_images, images_of
+from pnet.parts.expressions import Expression, length
+from pnet.parts.primitives import Circle, Corner, Direction, Freedom, Plane, Primitive
 
+Points = NDArray[np.float64]
 CENTROID = "centroid"
-
-
-class KeypointRule(StrEnum):
-    """Which of the equivalent keypoints is the label."""
-
-    CAMERA = "camera"  # equation 1: the geometrically unique one, nearest to the camera
-    CANONICAL = "canonical"  # the template's own, the ablation "w/o GU"
-
-
-@dataclass(frozen=True)
-class KeypointChoice:
-    """A rule, and the direction along which the camera rule compares.
-
-    Attributes:
-        rule: which equivalent is the label.
-        direction: camera-frame vector; the label is the equivalent that lies least far along it. The
-            paper's equation 1 has (0, 0, 1). Seen along its axis a ring has no nearest point under that,
-            and most flat parts lie so: an oblique or upright direction moves the ambiguity to rare views.
-    """
-
-    rule: KeypointRule = KeypointRule.CAMERA
-    direction: tuple[float, float, float] = (0.0, 0.0, 1.0)
-
-    def __post_init__(self) -> None:
-        if len(self.direction) != 3 or not any(self.direction) or not all(map(isfinite, self.direction)):
-            raise ValueError(f"targets.direction is {self.direction}, expected three numbers, not all zero")
-
-    @property
-    def frame(self) -> Tensor:
-        """(3, 3) float64 rotation whose rows are the x, y and z of equation 1 and its tie-breaks."""
-        z = torch.nn.functional.normalize(torch.tensor(self.direction, dtype=torch.float64), dim=0)
-        x = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
-        if abs(float(z[0])) > 0.9:  # x would be nearly along z: start from another axis
-            x = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-        x = torch.nn.functional.normalize(x - (x @ z) * z, dim=0)
-        return torch.stack([x, torch.linalg.cross(z, x), z])
 
 
 @dataclass(frozen=True)
 class Keypoint:
-    """One keypoint: `reference + factor · parameter · direction`.
+    """One keypoint: where the rule of a primitive puts it, seen from its reference.
 
     Attributes:
-        name: what it is, for pictures and logs.
-        reference: an earlier keypoint's name, or "centroid".
-        orbit: the equivalent directions, the template's first.
-        parameter: the parameter that the distance measures.
-        factor: distance / parameter.
+        name: what it is, for pictures and logs. reference: another keypoint's name, or "centroid".
+        primitive: where it lies. parameter: the parameter that its distance measures; None for a
+            keypoint that only serves as a reference, on a `Plane(…, at=…)` or a `Corner`.
+        factor: distance / parameter (0.5 where the parameter is a full width and the reference its middle).
     """
 
     name: str
     reference: str
-    orbit: Orbit
-    parameter: str
+    primitive: Primitive
+    parameter: str | None = None
     factor: float = 1.0
+
+
+def cone_keypoints(
+    rim: str, apex: str, reference: str, axis: Direction, radius: str, height: str
+) -> tuple[Keypoint, Keypoint]:
+    """Kp-in-cone: the apex angle is broken into two distances from the base's centre.
+
+    Args:
+        rim, apex: names of the two keypoints: one on the base circle (In-Prim), one at the tip.
+        reference: the base's centre. axis: from there to the tip. radius, height: parameters.
+    """
+    return (
+        Keypoint(rim, reference, Circle(axis), radius),
+        Keypoint(apex, reference, Plane(axis), height),
+    )
+
+
+def select_keypoints(declared: Sequence[Keypoint], parameters: Sequence[str]) -> tuple[Keypoint, ...]:
+    """The paper's selection loop: the centroid is the first reference, a found keypoint the next one.
+
+    Args:
+        declared: in any order. parameters: the part's parameter names.
+    Returns:
+        The keypoints, each after its reference.
+    Raises:
+        ValueError: a reference that is never found, a parameter that nothing measures.
+    """
+    found, waiting = [CENTROID], list(declared)
+    selected: list[Keypoint] = []
+    while waiting:
+        ready = [keypoint for keypoint in waiting if keypoint.reference in found]
+        if not ready:
+            lost = waiting[0]
+            raise ValueError(
+                f"keypoint {lost.name!r} refers to {lost.reference!r}, which is not one of {found}; "
+                "name the centroid or another keypoint that hangs on it"
+            )
+        selected += ready
+        found += [keypoint.name for keypoint in ready]
+        waiting = [keypoint for keypoint in waiting if keypoint not in ready]
+    check_names(selected, parameters)
+    return tuple(selected)
 
 
 class KeypointChain:
     """A part's keypoints, each hanging on the centroid or on an earlier one.
 
+    For finitely many equivalents, the label keypoints of an instance are one symmetry element's image of the
+    template's, so a choice made for one keypoint binds those that hang beside it; a keypoint that is free on
+    a circle or sphere is chosen by itself.
+
     Args:
-        keypoints: in order of selection.
-        parameters: the part's parameter names; each must be measured by at least one keypoint.
+        keypoints: the declaration. parameters: the part's parameter names.
+        symmetry, mirror: the part's; see `full_group`.
+        centroid: parameters (n, k) → (n, 3) the centroid in the frame of construction, metres; None: its origin.
+        typical: (k,) parameters of some part object, metres; tells which symmetry elements move a keypoint.
+
+    Attributes:
+        reference: (m) place of each keypoint's reference among centroid, keypoint 0, keypoint 1, …
+        group: (g, 3, 3) the part's symmetry elements, reflections too.
+        is_finite: (m) whether each keypoint and its references have finitely many equivalents.
+        chiralities: one or two (3, 3) matrices: the finite label keypoints are always a rotated image of the
+            template's seen through one of them ("two chirality structures at most", Section II.B).
     """
 
-    def __init__(self, keypoints: Sequence[Keypoint], parameters: Sequence[str]) -> None:
-        self.keypoints = tuple(keypoints)
+    def __init__(
+        self,
+        keypoints: Sequence[Keypoint],
+        parameters: Sequence[str],
+        symmetry: Symmetry,
+        mirror: Tensor | None = None,
+        centroid: Callable[[Points], Points] | None = None,
+        typical: Points | None = None,
+    ) -> None:
         self.parameters = tuple(parameters)
-        known = [CENTROID]
-        for keypoint in self.keypoints:
-            if keypoint.reference not in known:
-                raise ValueError(
-                    f"keypoint {keypoint.name!r} refers to {keypoint.reference!r}, which is not one of "
-                    f"{known}; name the centroid or an earlier keypoint"
-                )
-            if keypoint.parameter not in self.parameters:
-                raise ValueError(
-                    f"keypoint {keypoint.name!r} measures {keypoint.parameter!r}, "
-                    f"which is not one of the parameters {list(self.parameters)}"
-                )
-            known.append(keypoint.name)
-        for parameter in self.parameters:
-            if not any(keypoint.parameter == parameter for keypoint in self.keypoints):
-                raise ValueError(f"no keypoint determines the parameter {parameter!r}")
-        self._reference = [known.index(keypoint.reference) for keypoint in self.keypoints]
-        self._column = [self.parameters.index(keypoint.parameter) for keypoint in self.keypoints]
+        self.keypoints = select_keypoints(keypoints, self.parameters)
+        self.group = full_group(symmetry, mirror)
+        self._centroid = centroid
+        known = [CENTROID, *self.names]
+        self.reference = [known.index(keypoint.reference) for keypoint in self.keypoints]
+        size = np.linspace(1.0, 1.3, len(self.parameters)) if typical is None else typical
+        self.is_finite = self._find_finite()
+        template = self.canonical(torch.from_numpy(size))
+        check_declaration(self, symmetry, template)
+        self._equivalents = [
+            distinct_images(keypoint.primitive, step, self.group)
+            for keypoint, step in zip(self.keypoints, self.steps(template).unbind(-2), strict=True)
+        ]
+        self.chiralities = self._find_chiralities(template, mirror)
 
     def __len__(self) -> int:
         """m, the number of keypoints."""
@@ -111,6 +134,16 @@ class KeypointChain:
         """The keypoints' names in order."""
         return [keypoint.name for keypoint in self.keypoints]
 
+    def equivalents(self, keypoint: int) -> int:
+        """How many places symmetry elements that keep the reference in place carry a keypoint to."""
+        images, member = self._equivalents[keypoint]
+        kept = torch.ones(len(self.group), dtype=torch.bool)
+        reference = self.reference[keypoint]
+        while reference:
+            kept &= self._equivalents[reference - 1][1] == 0
+            reference = self.reference[reference - 1]
+        return len(torch.unique(member[kept])) if len(images) > 1 else 1
+
     def canonical(self, parameters: Tensor) -> Tensor:
         """The template's keypoints, in the part frame with the centroid at the origin.
 
@@ -119,46 +152,90 @@ class KeypointChain:
         Returns:
             (..., m, 3) metres.
         """
-        return self._hang(parameters, [keypoint.orbit.canonical for keypoint in self.keypoints])
+        places = [torch.zeros_like(parameters[..., :1]).expand(*parameters.shape[:-1], 3)]
+        for keypoint, reference in zip(self.keypoints, self.reference, strict=True):
+            start, direction = places[reference], keypoint.primitive.direction.to(parameters)
+            match keypoint:
+                case Keypoint(parameter=str() as name, factor=factor):
+                    distance = factor * parameters[..., self.parameters.index(name)]
+                    places.append(start + distance[..., None] * direction)
+                case Keypoint(primitive=Plane(at=at)) if at is not None:
+                    distance = self._length(at, parameters) - (start + self._origin(parameters)) @ direction
+                    places.append(start + distance[..., None] * direction)
+                case Keypoint(primitive=Corner(at=at)):
+                    corner = torch.stack([self._length(x, parameters) for x in at], -1)
+                    places.append(corner - self._origin(parameters))
+        return torch.stack(places[1:], -2)
 
-    def nearest_to_camera(self, parameters: Tensor, R: Tensor) -> Tensor:
-        """The geometrically unique keypoints of instances (equation 1), in the part frame.
+    def select(self, choice: KeypointChoice, parameters: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
+        """The label keypoints of instances under the camera or the canonical rule.
 
         Args:
-            parameters: (..., k) metres.
-            R: (..., 3, 3) part → camera.
+            choice: the rule. parameters: (..., k) metres. R: (..., 3, 3) part → camera.
         Returns:
-            (..., m, 3) metres. A keypoint stays on the side that its reference has chosen.
+            keypoints (..., m, 3) part frame, and margin (..., m), metres; see `choose`.
         """
-        directions = [keypoint.orbit.nearest_to_camera(R) for keypoint in self.keypoints]
-        return self._hang(parameters, directions)
+        template = self.canonical(parameters)
+        match choice.rule:
+            case KeypointRule.CAMERA:
+                return self.choose(NearestToCamera(choice.frame.to(R) @ R), template)
+            case KeypointRule.CANONICAL:
+                return template, torch.full_like(template[..., 0], torch.inf)
+        raise ValueError("the rule 'point' needs surface points: use choose(NearestToPoint(points), template)")
 
-    def select(self, choice: KeypointChoice, parameters: Tensor, R: Tensor) -> Tensor:
-        """The label keypoints under a choice; shapes as in `nearest_to_camera`."""
-        if choice.rule is KeypointRule.CAMERA:
-            return self.nearest_to_camera(parameters, choice.frame.to(R) @ R)
-        return self.canonical(parameters)
+    def choose(self, judge: Judge, template: Tensor) -> tuple[Tensor, Tensor]:
+        """Of all equivalents those that a rule prefers, keypoint by keypoint along the chain.
+
+        Args:
+            judge: the rule, with what it compares by; leading dimensions (...).
+            template: (..., m, 3) canonical keypoints, part frame, metres.
+        Returns:
+            keypoints (..., m, 3) metres, part frame; margin (..., m) metres: how much worse the runner-up is,
+            for this keypoint or for one that it hangs on. On a circle or sphere runners-up are arbitrarily
+            near: half the cost's range over it stands for the margin.
+        """
+        zero = torch.zeros_like(template[..., 0, :])
+        chosen, margins = [zero], [torch.full_like(zero[..., 0], torch.inf)]
+        alive: Tensor | None = None  # (..., g) the symmetry elements that agree with the choices so far
+        for i, step in enumerate(self.steps(template).unbind(-2)):
+            images, member = self._equivalents[i]
+            places, margin = self._candidates(i, judge, chosen[self.reference[i]], step)
+            if len(images) == 1:
+                place, margin = places[..., 0, :], margin[..., 0]
+            else:
+                may = allowed(alive, member, places[..., 0])
+                index, lead = first_by(judge.keys(places), may)
+                agree = member == index[..., None]
+                alive = agree if alive is None else alive & agree
+                place = places.gather(-2, index[..., None, None].expand(*index.shape, 1, 3))[..., 0, :]
+                margin = torch.minimum(lead, margin.gather(-1, index[..., None])[..., 0])
+            chosen.append(place)
+            margins.append(torch.minimum(margin, margins[self.reference[i]]))
+        return torch.stack(chosen[1:], -2), torch.stack(margins[1:], -1)
 
     def parameters_from_keypoints(self, centroid: Tensor, keypoints: Tensor) -> Tensor:
-        """Parameters as the distances that define the keypoints, in any frame (the module M_P).
+        """Parameters measured between keypoints (the module M_P).
 
         Args:
-            centroid: (..., 3), keypoints: (..., m, 3) metres.
+            centroid: (..., 3), keypoints: (..., m, 3) metres, any common frame.
         Returns:
-            (..., k) metres; the mean where several keypoints measure one parameter.
+            (..., k) metres; a parameter that several keypoints measure is their mean.
         """
-        points = torch.cat([centroid[..., None, :], keypoints], -2)
-        distance = torch.linalg.vector_norm(points[..., 1:, :] - points[..., self._reference, :], dim=-1)
-        factor = distance.new_tensor([keypoint.factor for keypoint in self.keypoints])
-        measured = distance / factor
-        columns = [
-            measured[..., [i for i, c in enumerate(self._column) if c == column]].mean(-1)
-            for column in range(len(self.parameters))
-        ]
+        columns = []
+        for name in self.parameters:
+            measured = [i for i, keypoint in enumerate(self.keypoints) if keypoint.parameter == name]
+            steps = self.steps(keypoints, centroid)[..., measured, :]
+            factor = steps.new_tensor([self.keypoints[i].factor for i in measured])
+            columns.append((torch.linalg.vector_norm(steps, dim=-1) / factor).mean(-1))
         return torch.stack(columns, -1)
 
+    def steps(self, keypoints: Tensor, centroid: Tensor | None = None) -> Tensor:
+        """From each keypoint's reference to it: (..., m, 3). centroid: (..., 3), None where it is the origin."""
+        origin = torch.zeros_like(keypoints[..., :1, :]) if centroid is None else centroid[..., None, :]
+        return keypoints - torch.cat([origin, keypoints], -2)[..., self.reference, :]
+
     def place_like(self, parameters: Tensor, observed: Tensor) -> Tensor:
-        """Template keypoints with the free ones (on rings and spheres) where an observation has them.
+        """Template keypoints with the free ones (on circles and spheres) where an observation has them.
 
         A finite choice is undone by the part's symmetry, so the template's own stands for it; a free
         keypoint's place on its circle is known only from the observation.
@@ -169,25 +246,87 @@ class KeypointChain:
         Returns:
             (..., m, 3) metres, part frame.
         """
-        points = torch.cat([torch.zeros_like(observed[..., :1, :]), observed], -2)
-        directions = []
-        for i, keypoint in enumerate(self.keypoints):
-            seen = points[..., i + 1, :] - points[..., self._reference[i], :]
-            finite = isinstance(keypoint.orbit, FiniteOrbit)
-            directions.append(keypoint.orbit.canonical.to(seen) if finite else keypoint.orbit.project(seen))
-        return self._hang(parameters, directions)
+        return self._replace_free(self.canonical(parameters), observed)
 
-    @property
-    def is_finite(self) -> list[bool]:
-        """(m,) whether each keypoint and all its references have finitely many equivalents."""
+    def turn_back(self, keypoints: Tensor) -> Tensor:
+        """Keypoints with the free ones turned to the template's place on their circle or sphere.
+
+        What is left after it differs between votes by their errors only.
+
+        Args:
+            keypoints: (..., m, 3) part frame, metres, any distances.
+        Returns:
+            (..., m, 3).
+        """
+        places = [torch.zeros_like(keypoints[..., 0, :])]
+        for i, (keypoint, step) in enumerate(zip(self.keypoints, self.steps(keypoints).unbind(-2), strict=True)):
+            along, radial = along_and_radial(keypoint.primitive, step)
+            if keypoint.primitive.freedom is not Freedom.NONE:
+                template = along_and_radial(keypoint.primitive, keypoint.primitive.direction.to(step))[1]
+                length = torch.linalg.vector_norm(radial, dim=-1, keepdim=True)
+                radial = length * torch.nn.functional.normalize(template, dim=-1)
+            places.append(places[self.reference[i]] + along + radial)
+        return torch.stack(places[1:], -2)
+
+    def _replace_free(self, template: Tensor, observed: Tensor) -> Tensor:
+        """The template with every free keypoint turned to the observed one's direction."""
+        template, observed = torch.broadcast_tensors(template, observed)
+        places = [torch.zeros_like(template[..., 0, :])]
+        seen = self.steps(observed).unbind(-2)
+        for i, (keypoint, step) in enumerate(zip(self.keypoints, self.steps(template).unbind(-2), strict=True)):
+            if keypoint.primitive.freedom is not Freedom.NONE:
+                along, radial = along_and_radial(keypoint.primitive, step)
+                towards = along_and_radial(keypoint.primitive, seen[i])[1]
+                length = torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
+                radius = torch.linalg.vector_norm(radial, dim=-1, keepdim=True)
+                turned = radius * towards / length.clamp(min=1e-12)
+                step = along + torch.where(length > 1e-9, turned, radial)
+            places.append(places[self.reference[i]] + step)
+        return torch.stack(places[1:], -2)
+
+    def _candidates(self, i: int, judge: Judge, start: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+        """Equivalents of keypoint i from its chosen reference: places (..., q, 3), and margins (..., q)."""
+        primitive, images = self.keypoints[i].primitive, self._equivalents[i][0].to(step)
+        along, radial = along_and_radial(primitive, step)
+        radius = torch.linalg.vector_norm(radial, dim=-1)[..., None]
+        centre = start[..., None, :] + images_of(along, images)
+        match primitive.freedom:
+            case Freedom.NONE:
+                return centre, torch.full_like(centre[..., 0], torch.inf)
+            case Freedom.TURN:
+                normal = images @ primitive.axis.to(step)
+                template = along_and_radial(primitive, primitive.direction.to(step))[1]
+                towards = images @ torch.nn.functional.normalize(template, dim=-1)
+                direction = judge.on_circle(centre, normal, towards)
+            case Freedom.SPHERE:
+                direction = judge.on_sphere(start)[..., None, :].expand_as(centre)
+        near, far = (centre + sign * radius[..., None] * direction for sign in (1, -1))
+        return near, (judge.keys(far)[0] - judge.keys(near)[0]).clamp(min=0) / 2
+
+    def _find_finite(self) -> list[bool]:
         finite = [True]
-        for keypoint, reference in zip(self.keypoints, self._reference, strict=True):
-            finite.append(finite[reference] and isinstance(keypoint.orbit, FiniteOrbit))
+        for keypoint, reference in zip(self.keypoints, self.reference, strict=True):
+            finite.append(finite[reference] and keypoint.primitive.freedom is Freedom.NONE)
         return finite[1:]
 
-    def _hang(self, parameters: Tensor, directions: list[Tensor]) -> Tensor:
-        points = [torch.zeros_like(parameters[..., :1]).expand(*parameters.shape[:-1], 3)]
-        for i, keypoint in enumerate(self.keypoints):
-            distance = keypoint.factor * parameters[..., self._column[i], None]
-            points.append(points[self._reference[i]] + distance * directions[i].to(parameters))
-        return torch.stack(points[1:], -2)
+    def _find_chiralities(self, template: Tensor, mirror: Tensor | None) -> list[Tensor]:
+        """The mirror makes a second structure unless some reflection leaves every finite keypoint in place."""
+        eye = torch.eye(3, dtype=torch.float64)
+        if mirror is None:
+            return [eye]
+        finite = template[self.is_finite]
+        improper = self.group[torch.linalg.det(self.group) < 0]
+        moved = (finite @ improper.mT - finite).abs().amax((-1, -2))
+        return [eye] if bool((moved < 1e-6 * finite.abs().max()).any()) else [eye, mirror.double()]
+
+    def _length(self, expression: Expression, parameters: Tensor) -> Tensor:
+        value = length(expression, self.parameters, parameters.detach().cpu().double().numpy())
+        return torch.from_numpy(np.array(value)).to(parameters)
+
+    def _origin(self, parameters: Tensor) -> Tensor:
+        """(..., 3) the centroid in the frame of construction, metres."""
+        if self._centroid is None:
+            return torch.zeros_like(parameters[..., :1]).expand(*parameters.shape[:-1], 3)
+        sizes = parameters.detach().cpu().double().reshape(-1, len(self.parameters)).numpy()
+        place = torch.from_numpy(np.array(self._centroid(sizes))).to(parameters)
+        return place.reshape(*parameters.shape[:-1], 3)

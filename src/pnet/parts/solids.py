@@ -1,68 +1,379 @@
-"""Watertight solids and convex pieces that several templates share."""
+"""Solids out of extrusions, revolutions and spheres with union and difference.
 
+Every shape tells its polyhedron's volume and first moment in closed form for many sizes at once, and for one
+size its mesh and convex pieces. Lengths are metres; circles are polygons of `sections` sides with their
+vertices on the circle.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import manifold3d
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from pnet.parts.clipping import convex_difference
+
 Points = NDArray[np.float64]
+# where a shape's own z goes: columns are the images of its x, y and z
+_FRAMES = {
+    "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+    "y": np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]),
+    "z": np.eye(3),
+}
 
 
-def circle(radius: float, sections: int) -> Points:
-    """(sections, 2) vertices of a regular polygon on a circle, counter-clockwise, the first on +x."""
-    angle = np.arange(sections) * (2 * np.pi / sections)
-    return radius * np.stack([np.cos(angle), np.sin(angle)], -1)
+class Shape(ABC):
+    """A closed body with a place; `a | b` unites, `a - b` cuts."""
+
+    axis: str
+    at: tuple[Points | float, ...]
+
+    @abstractmethod
+    def own_volume_and_moment(self, sections: int) -> tuple[Points, Points]:
+        """Volume (...) and first moment (..., 3) in the shape's own frame."""
+
+    @abstractmethod
+    def own_mesh(self, sections: int) -> trimesh.Trimesh:
+        """Watertight mesh of one size in the shape's own frame."""
+
+    @abstractmethod
+    def own_pieces(self, sections: int) -> list[Points]:
+        """Corners of convex pieces of one size, (n_i, 3) each, in the shape's own frame."""
+
+    def __or__(self, other: Shape | Solid) -> Solid:
+        return solid(self) | other
+
+    def __sub__(self, other: Shape | Solid) -> Solid:
+        return solid(self) - other
+
+    def volume_and_moment(self, sections: int) -> tuple[Points, Points]:
+        """Volume (...), m³, and first moment (..., 3), m⁴, about the origin of construction."""
+        volume, moment = self.own_volume_and_moment(sections)
+        place = np.stack(np.broadcast_arrays(*map(np.asarray, self.at)), -1)
+        return volume, moment @ _FRAMES[self.axis].T + volume[..., None] * place
+
+    def mesh(self, sections: int) -> trimesh.Trimesh:
+        """Watertight mesh of one size where it is placed."""
+        mesh = self.own_mesh(sections)
+        return mesh.apply_transform(self._matrix())
+
+    def pieces(self, sections: int) -> list[Points]:
+        """Convex pieces of one size where they are placed."""
+        matrix = self._matrix()
+        return [points @ matrix[:3, :3].T + matrix[:3, 3] for points in self.own_pieces(sections)]
+
+    def _matrix(self) -> Points:
+        matrix = np.eye(4)
+        matrix[:3, :3] = _FRAMES[self.axis]
+        matrix[:3, 3] = [float(x) for x in self.at]
+        return matrix
 
 
-def prism(outline: Points, bottom: float, top: float) -> trimesh.Trimesh:
-    """Convex prism over a convex outline.
+@dataclass(frozen=True, eq=False)
+class Extrusion(Shape):
+    """A simple polygon drawn along the axis.
 
-    Args:
-        outline: (n, 2) metres. bottom, top: z of the end faces, metres.
-    Returns:
-        A watertight mesh, faces wound outwards.
+    Attributes:
+        outline: (..., n, 2) counter-clockwise, metres. low, high: along the axis.
+        axis: "x", "y" or "z"; the outline's two coordinates are the next two in turn. at: shift.
     """
-    return trimesh.Trimesh(*_hull(extrude_points(outline, bottom, top)))
+
+    outline: Points
+    low: Points | float
+    high: Points | float
+    axis: str = "z"
+    at: tuple[Points | float, ...] = (0.0, 0.0, 0.0)
+
+    def own_volume_and_moment(self, sections: int) -> tuple[Points, Points]:
+        """Shoelace formulas times the height."""
+        a, b = self.outline, np.roll(self.outline, -1, -2)
+        cross = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+        area, first = cross.sum(-1) / 2, (cross[..., None] * (a + b)).sum(-2) / 6
+        low, high = np.asarray(self.low, float), np.asarray(self.high, float)
+        height = high - low
+        flat = first * height[..., None]
+        upright = area * (high**2 - low**2) / 2
+        flat, upright = np.broadcast_arrays(flat, upright[..., None])
+        return area * height, np.concatenate([flat, upright[..., :1]], -1)
+
+    def own_mesh(self, sections: int) -> trimesh.Trimesh:
+        """Outline triangulated, extruded."""
+        faces = np.asarray(manifold3d.triangulate([self.outline]))
+        low, height = float(self.low), float(self.high) - float(self.low)
+        mesh = trimesh.creation.extrude_triangulation(self.outline, faces, height)
+        return mesh.apply_translation([0, 0, low])
+
+    def own_pieces(self, sections: int) -> list[Points]:
+        """One prism over a convex outline, else one over each triangle."""
+        if _is_convex(self.outline):
+            return [extrude_points(self.outline, float(self.low), float(self.high))]
+        triangles = np.asarray(manifold3d.triangulate([self.outline]))
+        return [extrude_points(self.outline[t], float(self.low), float(self.high)) for t in triangles]
 
 
-def extrude_points(outline: Points, bottom: float, top: float) -> Points:
+@dataclass(frozen=True, eq=False)
+class Revolution(Shape):
+    """A profile turned about the axis.
+
+    Attributes:
+        profile: (..., n, 2) radius >= 0 and height along the axis, metres, counter-clockwise in that plane; a
+            profile may touch the axis. axis, at: as in `Extrusion`.
+    """
+
+    profile: Points
+    axis: str = "z"
+    at: tuple[Points | float, ...] = (0.0, 0.0, 0.0)
+
+    def own_volume_and_moment(self, sections: int) -> tuple[Points, Points]:
+        """∮ κ r² dz and ∮ κ r² z dz, κ r² the polygon's area; exact for straight edges."""
+        kappa = sections / 2 * np.sin(2 * np.pi / sections)
+        (r, z), (s, w) = np.moveaxis(self.profile, -1, 0), np.moveaxis(np.roll(self.profile, -1, -2), -1, 0)
+        rise = w - z
+        volume = kappa * (rise * (r * r + r * s + s * s) / 3).sum(-1)
+        weighted = z * (3 * r * r + 2 * r * s + s * s) + w * (r * r + 2 * r * s + 3 * s * s)
+        upright = kappa * (rise * weighted / 12).sum(-1)
+        return volume, np.stack([np.zeros_like(volume), np.zeros_like(volume), upright], -1)
+
+    def own_mesh(self, sections: int) -> trimesh.Trimesh:
+        """The lathe's mesh."""
+        return lathe(self.profile, sections)
+
+    def own_pieces(self, sections: int) -> list[Points]:
+        """Of every slab between two corner heights the frusta, or the sectors of a ring."""
+        pieces: list[Points] = []
+        for low, high, inner, outer in _slabs(self.profile):
+            pieces += _ring_pieces(low, high, inner, outer, sections)
+        return pieces
+
+
+@dataclass(frozen=True, eq=False)
+class Ball(Shape):
+    """A sphere; a polyhedron of circles of latitude.
+
+    Attributes:
+        radius: metres. axis: where its poles lie. at: its centre.
+    """
+
+    radius: Points | float
+    axis: str = "z"
+    at: tuple[Points | float, ...] = (0.0, 0.0, 0.0)
+
+    def own_volume_and_moment(self, sections: int) -> tuple[Points, Points]:
+        """Those of the turned half circle."""
+        return self._revolution(sections).own_volume_and_moment(sections)
+
+    def own_mesh(self, sections: int) -> trimesh.Trimesh:
+        """The turned half circle."""
+        return self._revolution(sections).own_mesh(sections)
+
+    def own_pieces(self, sections: int) -> list[Points]:
+        """One piece: it is convex."""
+        return [np.asarray(self.own_mesh(sections).vertices)]
+
+    def _revolution(self, sections: int) -> Revolution:
+        angle = np.linspace(-np.pi / 2, np.pi / 2, sections // 2 + 1)
+        half = np.stack([np.cos(angle), np.sin(angle)], -1)
+        half[[0, -1], 0] = 0.0
+        return Revolution(np.asarray(self.radius, float)[..., None, None] * half)
+
+
+class Operation(StrEnum):
+    """What a step of a construction does."""
+
+    ADD = "add"
+    CUT = "cut"
+    HOLE = "hole"  # a cut too narrow for another part to enter: physics may leave it out
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """Shapes added and cut one after another.
+
+    Attributes:
+        steps: (operation, shape), the first an ADD.
+    """
+
+    steps: tuple[tuple[Operation, Shape], ...]
+
+    def __or__(self, other: Shape | Solid) -> Solid:
+        added = solid(other)
+        if any(operation is not Operation.ADD for operation, _ in added.steps):
+            raise ValueError("unite plain shapes first, then cut: (a | b) - c")
+        return Solid(self.steps + added.steps)
+
+    def __sub__(self, other: Shape | Solid) -> Solid:
+        return Solid(self.steps + tuple((self._cutting(operation), s) for operation, s in solid(other).steps))
+
+    @staticmethod
+    def _cutting(operation: Operation) -> Operation:
+        if operation is Operation.CUT:
+            raise ValueError("cut with plain shapes: a - b - c, not a - (b - c)")
+        return Operation.HOLE if operation is Operation.HOLE else Operation.CUT
+
+    def signed_volume_and_moment(self, sections: int) -> tuple[Points, Points]:
+        """Σ ± volume (...) and Σ ± moment (..., 3): the solid's own where added shapes don't overlap each
+        other and cut ones lie inside them without overlapping."""
+        volume, moment = np.zeros(()), np.zeros(3)
+        for operation, shape in self.steps:
+            sign = 1.0 if operation is Operation.ADD else -1.0
+            v, m = shape.volume_and_moment(sections)
+            volume, moment = volume + sign * v, moment + sign * m
+        return volume, moment
+
+    def mesh(self, sections: int) -> trimesh.Trimesh:
+        """Watertight mesh of one size, faces wound outwards; without faces where nothing is left."""
+        (_, first), *others = self.steps
+        if not others:
+            return first.mesh(sections)
+        whole = manifold(first.mesh(sections))
+        for operation, shape in others:
+            part = manifold(shape.mesh(sections))
+            whole = whole + part if operation is Operation.ADD else whole - part
+        found = whole.to_mesh64()
+        return trimesh.Trimesh(found.vert_properties[:, :3], found.tri_verts.astype(np.int64), process=False)
+
+    def pieces(self, sections: int, fill_holes: bool) -> list[Points]:
+        """Convex pieces whose union is the solid, (n_i, 3) each; they may overlap.
+
+        Args:
+            sections: as in the mesh. fill_holes: leave the steps marked as holes out.
+        """
+        pieces: list[Points] = []
+        for operation, shape in self.steps:
+            if operation is Operation.ADD:
+                pieces += shape.pieces(sections)
+            elif operation is Operation.CUT or not fill_holes:
+                for cutter in shape.pieces(sections):
+                    pieces = [rest for piece in pieces for rest in convex_difference(piece, cutter)]
+        return pieces
+
+
+def solid(body: Shape | Solid) -> Solid:
+    """A shape as a solid of one step."""
+    return body if isinstance(body, Solid) else Solid(((Operation.ADD, body),))
+
+
+def hole(shape: Shape) -> Solid:
+    """Marks a cut as a hole: `body - hole(cylinder(…))`."""
+    return Solid(((Operation.HOLE, shape),))
+
+
+def cylinder(radius: Points | float, low: Points | float, high: Points | float) -> Revolution:
+    """A round bar along z from low to high; `.moved(axis=…, at=…)` puts it elsewhere."""
+    return cone(radius, radius, low, high)
+
+
+def cone(
+    low_radius: Points | float, high_radius: Points | float, low: Points | float, high: Points | float
+) -> Revolution:
+    """A cone or frustum along z; one of the radii may be 0."""
+    radius = np.broadcast_arrays(np.zeros(()), low_radius, high_radius, np.zeros(()))
+    height = np.broadcast_arrays(low, low, high, high)
+    return Revolution(np.stack(np.broadcast_arrays(np.stack(radius, -1), np.stack(height, -1)), -1))
+
+
+def prism(outline: Points, low: Points | float, high: Points | float) -> Extrusion:
+    """A polygon (..., n, 2) extruded along z."""
+    return Extrusion(outline, low, high)
+
+
+def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> Extrusion:
+    """A cuboid by its extents, metres."""
+    corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
+    outline = np.stack([np.stack(np.broadcast_arrays(*corner), -1) for corner in corners], -2)
+    return Extrusion(outline.astype(float), *z)
+
+
+def moved(shape: Shape, axis: str = "z", at: tuple[Points | float, ...] = (0.0, 0.0, 0.0)) -> Shape:
+    """The shape with its own z along another axis and its origin at `at`."""
+    if axis not in _FRAMES:
+        raise ValueError(f"axis {axis!r}: choose x, y or z")
+    return replace(shape, axis=axis, at=at)  # type: ignore[type-var]
+
+
+def polygon(sides: int, circumradius: Points | float) -> Points:
+    """(..., sides, 2) vertices of a regular polygon, counter-clockwise, the first on +x."""
+    angle = np.arange(sides) * (2 * np.pi / sides)
+    return np.asarray(circumradius, float)[..., None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+
+
+def extrude_points(outline: Points, low: float, high: float) -> Points:
     """(2n, 3) the outline at both heights."""
-    return np.concatenate([np.c_[outline, np.full(len(outline), z)] for z in (bottom, top)])
+    return np.concatenate([np.c_[outline, np.full(len(outline), z)] for z in (low, high)])
 
 
 def lathe(profile: Points, sections: int) -> trimesh.Trimesh:
-    """Solid of revolution about z of a closed profile that stays off the axis.
+    """Mesh of a closed profile turned about z.
 
     Args:
-        profile: (n, 2) radius and z, metres, radius > 0, counter-clockwise in the (radius, z) plane.
+        profile: (n, 2) radius and z, metres, radius >= 0, counter-clockwise in the (radius, z) plane.
         sections: polygon sides about the axis.
     Returns:
-        A watertight ring-shaped mesh, faces wound outwards.
+        A watertight mesh, faces wound outwards.
     """
-    ring = circle(1.0, sections)
-    n = len(profile)
+    ring, n = polygon(sections, 1.0), len(profile)
     vertices = np.concatenate([np.c_[profile[:, :1] * direction, profile[:, 1:]] for direction in ring])
     s, p = np.divmod(np.arange(sections * n), n)
     here, up = s * n + p, s * n + (p + 1) % n
     beside, across = (here + n) % (sections * n), (up + n) % (sections * n)
     faces = np.concatenate([np.c_[here, beside, across], np.c_[here, across, up]])
-    return trimesh.Trimesh(vertices, faces, process=False)
+    # corners on the axis come once a section: let one stand for all, and drop what has no area
+    on_axis = np.tile(profile[:, 0] == 0, sections)
+    own = np.where(on_axis, np.tile(np.arange(n), sections), np.arange(sections * n))
+    faces = own[faces]
+    a, b, c = faces.T
+    mesh = trimesh.Trimesh(vertices, faces[(a != b) & (b != c) & (c != a)], process=False)
+    mesh.remove_unreferenced_vertices()
+    return mesh
 
 
-def ring_sectors(inner: Points, outer: Points, bottom: float, top: float) -> list[Points]:
-    """Convex sectors of a straight ring between two polygons of equally many vertices.
+def manifold(mesh: trimesh.Trimesh) -> manifold3d.Manifold:
+    """A watertight mesh for Boolean operations in double precision."""
+    vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.uint64)
+    return manifold3d.Manifold(manifold3d.Mesh64(vertices, faces))
 
-    Args:
-        inner, outer: (n, 2) metres, vertices at the same angles. bottom, top: metres.
-    Returns:
-        n arrays (8, 3): each the corners of one sector.
-    """
-    following = np.roll(np.arange(len(inner)), -1)
+
+def _is_convex(outline: Points) -> bool:
+    edge = np.roll(outline, -1, 0) - outline
+    following = np.roll(edge, -1, 0)
+    return bool((edge[:, 0] * following[:, 1] - edge[:, 1] * following[:, 0] >= -1e-15).all())
+
+
+def _slabs(profile: Points) -> list[tuple[float, float, tuple[float, float], tuple[float, float]]]:
+    """Trapezoids of a profile between its corner heights: low, high, inner and outer radius at both."""
+    edges = [(a, b) for a, b in zip(profile, np.roll(profile, -1, 0), strict=True) if a[1] != b[1]]
+    heights = np.unique(profile[:, 1])
+    slabs = []
+    for low, high in zip(heights[:-1], heights[1:], strict=True):
+        across = []
+        for a, b in edges:
+            bottom, top = sorted((a[1], b[1]))
+            if bottom <= low and top >= high:
+                share = (np.array([low, high]) - a[1]) / (b[1] - a[1])
+                across.append(a[0] + share * (b[0] - a[0]))
+        across.sort(key=lambda radii: float(radii.sum()))
+        for inner, outer in zip(across[::2], across[1::2], strict=True):
+            slabs.append((float(low), float(high), tuple(inner.tolist()), tuple(outer.tolist())))
+    return slabs
+
+
+def _ring_pieces(
+    low: float, high: float, inner: tuple[float, float], outer: tuple[float, float], sections: int
+) -> list[Points]:
+    ring = polygon(sections, 1.0)
+
+    def circle(radius: float, z: float) -> Points:
+        return np.c_[radius * ring, np.full(sections, z)]
+
+    corners = [circle(r, z) for radii in (inner, outer) for r, z in zip(radii, (low, high), strict=True)]
+    if max(inner) == 0:
+        return [np.unique(np.concatenate(corners[2:]), axis=0)]
+    stacked = np.stack(corners, 1)
     return [
-        extrude_points(np.stack([inner[i], outer[i], outer[j], inner[j]]), bottom, top)
-        for i, j in enumerate(following)
+        np.unique(np.concatenate([stacked[i], stacked[(i + 1) % sections]]), axis=0) for i in range(sections)
     ]
-
-
-def _hull(points: Points) -> tuple[Points, NDArray[np.int64]]:
-    hull = trimesh.convex.convex_hull(points)
-    return np.asarray(hull.vertices), np.asarray(hull.faces)

@@ -9,7 +9,6 @@ from pnet.parts.keypoints import KeypointChain
 
 def fit_pose(
     chain: KeypointChain,
-    mirror: Tensor | None,
     parameters: Tensor,
     centroid: Tensor,
     keypoints: Tensor,
@@ -18,7 +17,7 @@ def fit_pose(
     """Fit the template to every instance; with two chiralities the one with the smaller error.
 
     Args:
-        chain: the part's keypoints. mirror: (3, 3) improper symmetry of the part, or None.
+        chain: the part's keypoints.
         parameters: (d, k), centroid: (d, 3), keypoints: (d, m, 3) camera frame, metres.
         weight: (d, 1 + m) trust in the centroid and each keypoint, or None for equation 6's equal weights.
     Returns:
@@ -27,30 +26,31 @@ def fit_pose(
     target = torch.cat([centroid[:, None], keypoints], 1)
     if weight is None:
         weight = torch.ones_like(target[..., 0])
-    R, t, error = _fit_chirality(chain, parameters, target, weight, torch.eye(3).to(target))
-    if mirror is not None:
-        R2, t2, error2 = _fit_chirality(chain, parameters, target, weight, mirror.to(target))
-        better = error2 < error
-        R = torch.where(better[:, None, None], R2, R)
-        t = torch.where(better[:, None], t2, t)
+    fits = [_fit_chirality(chain, parameters, target, weight, M.to(target)) for M in chain.chiralities]
+    R, t, error = fits[0]
+    for other_R, other_t, other_error in fits[1:]:
+        better = other_error < error
+        R = torch.where(better[:, None, None], other_R, R)
+        t = torch.where(better[:, None], other_t, t)
     return R, t
 
 
 def _fit_chirality(
     chain: KeypointChain, parameters: Tensor, target: Tensor, weight: Tensor, mirror: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Fit the template seen through `mirror`, an involution.
+    """Fit the template seen through `mirror`: the identity or an improper symmetry.
 
     Keypoints on circles and spheres carry no knowledge of the pose about their axis: a first fit leaves
     them out, then each is placed on its circle where the observation has it. So the template matches
     the labels' geometry exactly, whatever the view.
     """
     finite = target.new_tensor([1.0, *map(float, chain.is_finite)])
-    template = _with_centroid(chain.canonical(parameters)) @ mirror
+    template = _with_centroid(chain.canonical(parameters)) @ mirror.mT
     R, t = fit_rigid(template, target, weight * finite)
-    observed = apply_inverse_pose(R, t, target[:, 1:]) @ mirror
-    template = _with_centroid(chain.place_like(parameters, observed)) @ mirror
-    R, t = fit_rigid(template, target, weight)
+    if not all(chain.is_finite):
+        observed = apply_inverse_pose(R, t, target[:, 1:]) @ mirror
+        template = _with_centroid(chain.place_like(parameters, observed)) @ mirror.mT
+        R, t = fit_rigid(template, target, weight)
     error = (weight * (apply_pose(R, t, template) - target).square().sum(-1)).sum(-1)
     return R, t, error
 

@@ -6,11 +6,10 @@ import torch
 from torch import Tensor
 
 from pnet.parts.base import ParametricPart
-from pnet.parts.keypoints import KeypointChain
 from pnet.postprocess.cluster import CentroidClusters
 from pnet.postprocess.fit import fit_pose
 from pnet.postprocess.radius_filter import RadiusFilter
-from pnet.postprocess.vote import vote, vote_spread
+from pnet.postprocess.vote import PointVotes, Voting, vote
 from pnet.records import Detections, PointPrediction
 
 
@@ -20,6 +19,7 @@ class PoseRecovery:
 
     Attributes:
         cluster: instance segmentation. radius_filter: None is the ablation "w/o RF".
+        voting: how the votes of a cluster are brought together.
         visibility_threshold: T_v; instances with a lower voted visibility are left out (with M_V only).
         scene_parameters: average the parameters over the scene's best visible instances, as the released
             code does: right where a scene holds one part object. best_visible: those whose visibility
@@ -32,6 +32,7 @@ class PoseRecovery:
 
     cluster: CentroidClusters
     radius_filter: RadiusFilter | None
+    voting: Voting
     visibility_threshold: float
     scene_parameters: bool
     best_visible: float
@@ -50,28 +51,24 @@ class PoseRecovery:
         if d == 0:
             return no_detections(part, len(labels))
         visibility = self._score(prediction, scene, labels, d)
-        targets = torch.cat([centroids[:, None], keypoints], 1)
-        votes, weight = self._vote_all(targets, labels, d)
-        parameters = self._parameters(part.chain, centroids, keypoints, labels, visibility)
-        R, t = fit_pose(part.chain, part.mirror, parameters, votes[:, 0], votes[:, 1:], weight)
-        found = Detections(R, t, parameters, visibility, votes[:, 1:], labels)
+        votes = PointVotes(centroids, keypoints, labels, d, self._reliable(centroids, keypoints, labels))
+        agreed = self.voting(part, votes)
+        parameters = self._share(agreed.parameters, visibility)
+        if part.is_fixed:
+            parameters = torch.from_numpy(part.grids["L"][0]).expand_as(parameters).clone()
+        weight = None if self.trust is None else 1 / (agreed.spread.square() + self.trust**2)
+        R, t = fit_pose(part.chain, parameters, agreed.centroid, agreed.keypoints, weight)
+        found = Detections(R, t, parameters, visibility, agreed.keypoints, labels)
         # without M_V nothing is known of visibility, so nothing is left out for it
         threshold = self.visibility_threshold if prediction.visibility is not None else 0.0
         return best_first(found, visibility >= threshold)
 
-    def _vote_all(self, targets: Tensor, labels: Tensor, d: int) -> tuple[Tensor, Tensor | None]:
-        """Voted centroid and keypoints (d, 1 + m, 3), and their weights in the fit (d, 1 + m)."""
-        voted, spread = [], []
-        for values in targets.unbind(1):
-            kept = self._reliable(values, labels)
-            voted.append(vote(values, labels, kept, d))
-            spread.append(vote_spread(values, labels, kept, voted[-1]))
-        if self.trust is None:
-            return torch.stack(voted, 1), None
-        return torch.stack(voted, 1), 1 / (torch.stack(spread, 1).square() + self.trust**2)
-
-    def _reliable(self, votes: Tensor, labels: Tensor) -> Tensor:
-        return labels >= 0 if self.radius_filter is None else self.radius_filter(votes, labels)
+    def _reliable(self, centroids: Tensor, keypoints: Tensor, labels: Tensor) -> Tensor:
+        """(N, 1 + m) which votes count: those in a cluster that the radius filter keeps."""
+        places = torch.cat([centroids[:, None], keypoints], 1)
+        if self.radius_filter is None:
+            return (labels >= 0)[:, None].expand(-1, places.shape[1])
+        return torch.stack([self.radius_filter(votes, labels) for votes in places.unbind(1)], 1)
 
     def _score(self, prediction: PointPrediction, scene: int, labels: Tensor, d: int) -> Tensor:
         """(d,) voted visibility; without M_V each cluster's number of points over the largest."""
@@ -80,21 +77,12 @@ class PoseRecovery:
         size = torch.bincount(labels[labels >= 0], minlength=d).double()
         return size / size.max()
 
-    def _parameters(
-        self,
-        chain: KeypointChain,
-        centroids: Tensor,
-        keypoints: Tensor,
-        labels: Tensor,
-        visibility: Tensor,
-    ) -> Tensor:
-        """(d, k) module M_P: parameters of every point, voted per instance, metres."""
-        per_point = chain.parameters_from_keypoints(centroids, keypoints)
-        parameters = vote(per_point, labels, labels >= 0, len(visibility))
-        if self.scene_parameters:
-            best = visibility >= self.best_visible * visibility.max()
-            parameters = parameters[best].mean(0).expand_as(parameters).clone()
-        return parameters
+    def _share(self, parameters: Tensor, visibility: Tensor) -> Tensor:
+        """(d, k) parameters, those of a scene's best visible instances for all if `scene_parameters`."""
+        if not self.scene_parameters:
+            return parameters
+        best = visibility >= self.best_visible * visibility.max()
+        return parameters[best].mean(0).expand_as(parameters).clone()
 
 
 def best_first(found: Detections, keep: Tensor) -> Detections:

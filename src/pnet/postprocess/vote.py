@@ -1,6 +1,69 @@
 """Hough voting: each cluster's reliable votes are averaged."""
 
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
 from torch import Tensor
+
+from pnet.parts.base import ParametricPart
+
+
+@dataclass(frozen=True, eq=False)
+class PointVotes:
+    """What the points of one scene say of their instances.
+
+    Attributes:
+        centroid: (N, 3), keypoints: (N, m, 3) camera frame, metres.
+        owner: (N,) cluster in [0, d), −1 for none. d: number of clusters.
+        reliable: (N, 1 + m) bool: which votes for the centroid and each keypoint count; at least one a cluster.
+    """
+
+    centroid: Tensor
+    keypoints: Tensor
+    owner: Tensor
+    d: int
+    reliable: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class InstanceVotes:
+    """What the clusters agreed on.
+
+    Attributes:
+        centroid: (d, 3), keypoints: (d, m, 3) camera frame, metres. parameters: (d, k) metres.
+        spread: (d, 1 + m) root mean square distance of the counted votes from it, metres.
+    """
+
+    centroid: Tensor
+    keypoints: Tensor
+    parameters: Tensor
+    spread: Tensor
+
+
+class Voting(Protocol):
+    """Brings the votes of every cluster together."""
+
+    def __call__(self, part: ParametricPart, votes: PointVotes) -> InstanceVotes:
+        """One set of keypoints and parameters for every cluster."""
+        ...
+
+
+@dataclass(frozen=True)
+class MeanVote:
+    """The paper's: plain means; the votes of an instance must mean the same one of the equivalent keypoints."""
+
+    def __call__(self, part: ParametricPart, votes: PointVotes) -> InstanceVotes:
+        """Means of centroids, keypoints and, point by point (module M_P), parameters."""
+        targets = torch.cat([votes.centroid[:, None], votes.keypoints], 1)
+        voted, spread = [], []
+        for values, kept in zip(targets.unbind(1), votes.reliable.unbind(1), strict=True):
+            voted.append(vote(values, votes.owner, kept, votes.d))
+            spread.append(vote_spread(values, votes.owner, kept, voted[-1]))
+        places = torch.stack(voted, 1)
+        per_point = part.chain.parameters_from_keypoints(votes.centroid, votes.keypoints)
+        parameters = vote(per_point, votes.owner, votes.owner >= 0, votes.d)
+        return InstanceVotes(places[:, 0], places[:, 1:], parameters, torch.stack(spread, 1))
 
 
 def vote(values: Tensor, labels: Tensor, kept: Tensor, clusters: int) -> Tensor:

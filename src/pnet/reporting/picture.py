@@ -50,16 +50,13 @@ def scene_picture(scene: Scene, detections: Detections, part: ParametricPart, pa
     points = scene.points[: len(instance)].astype(np.float64)
     camera = crop(scene.camera, points, np.asarray(found.mesh.vertices))
     figure = Figure(figsize=(SIZE[0] / 100, SIZE[1] / 100), dpi=100, facecolor=BACKGROUND)
-    left, right = _panel(figure, 8), _panel(figure, SIZE[0] - PANEL - 8)
+    left, right = (pixel_axes(figure, (x, 64), (PANEL, PANEL)) for x in (8, SIZE[0] - PANEL - 8))
     _draw_cloud(left, camera, points, point_colours(instance, len(detections.score)))
     image, depth = render_bodies(camera, found, instance_colours(len(detections.score)))
-    right.imshow(image, extent=(-0.5, PANEL - 0.5, PANEL - 0.5, -0.5), interpolation="antialiased")
+    draw_image(right, image)
     _draw_unexplained(right, camera, points, depth)
     _caption(figure, *caption_texts(scene, detections, found.missing))
-    buffer = BytesIO()
-    FigureCanvasAgg(figure)
-    figure.savefig(buffer, format="png")
-    write_atomically(path, buffer.getvalue())
+    write_png(figure, path)
 
 
 def crop(camera: Camera, points: Points, vertices: Points) -> Camera:
@@ -225,13 +222,33 @@ def _cloud_light(points: Points) -> Points:
     return (0.16 + sky) * (0.7 + 0.35 * np.clip(nearness, 0, 1))
 
 
-def _panel(figure: Figure, left: float) -> Axes:
-    bottom = SIZE[1] - PANEL - 64
-    box = (left / SIZE[0], bottom / SIZE[1], PANEL / SIZE[0], PANEL / SIZE[1])
+def pixel_axes(figure: Figure, corner: tuple[int, int], size: tuple[int, int]) -> Axes:
+    """Axes whose data coordinates are pixels, (0, 0) the centre of the upper left one.
+
+    Args:
+        corner: pixels from the figure's left and upper border. size: width and height, pixels.
+    """
+    (left, top), (width, height) = corner, size
+    whole, high = figure.get_size_inches() * figure.dpi
+    box = (left / whole, 1 - (top + height) / high, width / whole, height / high)
     axes = figure.add_axes(box, facecolor=BACKGROUND)
-    axes.set(xlim=(-0.5, PANEL - 0.5), ylim=(PANEL - 0.5, -0.5), autoscale_on=False)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), autoscale_on=False)
     axes.set_axis_off()
     return axes
+
+
+def draw_image(axes: Axes, image: Points) -> None:
+    """Fill `pixel_axes` with an image (h, w, 3) in [0, 1] of any resolution."""
+    extent = (*axes.get_xlim(), *axes.get_ylim())
+    axes.imshow(image, extent=extent, interpolation="antialiased")
+
+
+def write_png(figure: Figure, path: Path) -> None:
+    """Write a figure; the file appears when it is whole."""
+    buffer = BytesIO()
+    FigureCanvasAgg(figure)
+    figure.savefig(buffer, format="png")
+    write_atomically(path, buffer.getvalue())
 
 
 def _caption(figure: Figure, headings: tuple[str, str], foot: str) -> None:

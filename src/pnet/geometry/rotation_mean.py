@@ -1,0 +1,56 @@
+"""Mean rotation modulo a symmetry group, robust against outliers."""
+
+import roma
+import torch
+from torch import Tensor
+
+from pnet.geometry.rigid import rotation_angle
+from pnet.geometry.symmetry import Symmetry, nearest_equivalent
+
+STARTS = 12  # hypotheses from which the climb to a mode starts
+ROUNDS = 12  # of re-weighting
+
+
+def mean_rotation(R: Tensor, weight: Tensor, symmetry: Symmetry, width: float) -> Tensor:
+    """The rotation on which most hypotheses agree, up to the symmetry.
+
+    Hypotheses that differ by symmetry elements agree. Each is brought to the equivalent nearest to the current
+    mean (so nothing is averaged across elements), weighted by how near that is, and averaged in the chordal
+    metric; the climb starts at several hypotheses and the one with the most support wins.
+
+    Args:
+        R: (..., n, 3, 3) hypotheses, part → camera. weight: (..., n) trust, non-negative, some positive.
+        symmetry: the part's proper group. width: angle at which a hypothesis no longer counts, radians.
+    Returns:
+        (..., 3, 3).
+    Note:
+        For a revolution the turn about the axis is arbitrary, for a sphere the whole rotation.
+    """
+    starts = _starts(R, weight)
+    support = (weight[..., None, :] * _nearness(R, starts, symmetry, 2 * width)[1]).sum(-1)
+    best = support.argmax(-1)[..., None, None, None].expand(*support.shape[:-1], 1, 3, 3)
+    mean = starts.gather(-3, best)
+    for shrink in torch.linspace(2.0, 1.0, ROUNDS).tolist():
+        aligned, near = _nearness(R, mean, symmetry, shrink * width)
+        pull = weight[..., None, :] * near
+        # a start with no company keeps its place
+        total = (pull[..., None, None] * aligned).sum(-3) + 1e-12 * mean
+        mean = roma.special_procrustes(total)
+    return mean.squeeze(-3)
+
+
+def _starts(R: Tensor, weight: Tensor) -> Tensor:
+    """(..., s, 3, 3) the hypotheses of most weight, thinned out evenly."""
+    n = R.shape[-3]
+    order = torch.argsort(weight, dim=-1, descending=True, stable=True)[..., : max(1, (n + 1) // 2)]
+    pick = torch.linspace(0, order.shape[-1] - 1, min(STARTS, order.shape[-1])).round().long()
+    index = order[..., pick.to(order.device)]
+    return R.gather(-3, index[..., None, None].expand(*index.shape, 3, 3))
+
+
+def _nearness(R: Tensor, mean: Tensor, symmetry: Symmetry, width: float) -> tuple[Tensor, Tensor]:
+    """Hypotheses aligned to every mean (..., s, n, 3, 3), and Tukey's weight of their angle (..., s, n)."""
+    reference = mean[..., :, None, :, :]
+    aligned = nearest_equivalent(R[..., None, :, :, :], reference, symmetry)
+    angle = rotation_angle(aligned, reference.expand_as(aligned))
+    return aligned, (1 - (angle / width).square()).clamp(min=0).square()

@@ -1,0 +1,44 @@
+"""TN42: a tapered bar, a prism over a right trapezoid. x along the bar, z up, y across; one mirror plane.
+
+The publication shows only a picture; the sizes are ours.
+"""
+
+import numpy as np
+
+from pnet.geometry.symmetry import cyclic, reflection
+from pnet.parts.base import ParametricPart, Points
+from pnet.parts.keypoints import Keypoint
+from pnet.parts.primitives import Corner, Plane
+from pnet.parts.solids import Shape, moved, prism
+
+SMALL_END = 0.006  # height of the small end, metres
+
+
+class TN42(ParametricPart):
+    """Length l, height a of the large end, thickness w; the small end's height is fixed."""
+
+    name = "tn42"
+    parameter_names = ("l", "a", "w")
+    symmetry = cyclic(1)
+    mirror = reflection((0, 1, 0))
+    keypoints = (
+        Keypoint("foot", "centroid", Corner((0, 0, 0))),  # middle of the large end's lower edge
+        Keypoint("toe", "foot", Plane("x"), "l"),
+        Keypoint("head", "foot", Plane("z"), "a"),
+        Keypoint("side", "centroid", Plane("y"), "w", factor=0.5),
+    )
+
+    def check(self, parameters: Points) -> None:
+        """The large end must be the larger one."""
+        if parameters[1] <= SMALL_END:
+            raise ValueError(
+                f"tn42: the large end (a = {1000 * parameters[1]:g} mm) must be higher than the small one "
+                f"({1000 * SMALL_END:g} mm)"
+            )
+
+    def solid(self, parameters: Points) -> Shape:
+        """The trapezoid in the zx plane, extruded along y."""
+        length, a, w = self.split(parameters)
+        corners = [(0, 0), (a, 0), (SMALL_END, length), (0, length)]  # z, x
+        outline = np.stack([np.stack(np.broadcast_arrays(*zx, 0.0 * a), -1)[..., :2] for zx in corners], -2)
+        return moved(prism(outline, -w / 2, w / 2), axis="y")
