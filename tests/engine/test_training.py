@@ -19,6 +19,7 @@ from pnet.engine.training import PoseTraining
 from pnet.models.losses import ParametricLoss
 from pnet.models.parametricnet import ParametricNet
 from pnet.postprocess.cluster import CentroidClusters
+from pnet.postprocess.folded_vote import FoldedVote
 from pnet.postprocess.pipeline import PoseRecovery
 from pnet.postprocess.vote import MeanVote
 
@@ -54,7 +55,18 @@ def root(tmp_path_factory, tn34, write_split):
     return root
 
 
-def fit(root, part, folder, backbone, seed=0, interrupt=None, resume=False, identity="one", extra=()):
+def fit(
+    root,
+    part,
+    folder,
+    backbone,
+    seed=0,
+    interrupt=None,
+    resume=False,
+    identity="one",
+    extra=(),
+    rule="camera",
+):
     """Train for nine steps of two scenes; a checkpoint every three."""
     lightning.seed_everything(seed, verbose=False)
     network = ParametricNet(backbone(), 3, [8], [8], 0.02, True)
@@ -62,9 +74,10 @@ def fit(root, part, folder, backbone, seed=0, interrupt=None, resume=False, iden
     schedule, loss = WarmupCosine(0.1, 0.01), ParametricLoss(part.chain, "each")
     module = PoseTraining(network, loss, optimizer, schedule, False, {"backbone": identity})
     data = SceneDataModule(
-        part, root, Targets(), Augmentation(True, 1e-4), None, 2, 2 * EPOCH_STEPS, 1, 0, seed
+        part, root, Targets(rule), Augmentation(True, 1e-4), None, 2, 2 * EPOCH_STEPS, 1, 0, seed
     )
-    recovery = PoseRecovery(CentroidClusters(0.01, 2, 4), None, MeanVote(), 0.0, False, 0.9, None)
+    voting = FoldedVote(16, 32, 25.0, 3.0) if rule == "point" else MeanVote()
+    recovery = PoseRecovery(CentroidClusters(0.01, 2, 4), None, voting, 0.0, False, 0.9, None)
     validation = PoseValidation(NetworkEstimator(part, network, recovery), data.scenes("val"), None, 0)
     callbacks = [validation, ResumableCheckpoint(folder), *extra]
     callbacks += [InterruptAt(interrupt)] if interrupt else []
@@ -140,6 +153,14 @@ def test_losses_and_poses_of_validation_are_logged(root, tn34, tmp_path):
             assert f"{stage}_loss/{term}" in metrics
     shares = {name: float(metrics[f"ambiguous_labels/{name}"]) for name in tn34.chain.names}
     assert shares["base"] == shares["top"] == 0 and 0 <= shares["rim"] <= 1
+
+
+@pytest.mark.parametrize("rule", ["canonical", "point"])
+def test_every_rule_trains_and_is_validated(root, tn34, tmp_path, rule):
+    metrics = fit(root, tn34, tmp_path, pointnet2, rule=rule).trainer.callback_metrics
+    assert 0 < float(metrics["train/loss"]) < 1e6 and 0 <= float(metrics["val/AP"]) <= 1
+    if rule == "canonical":
+        assert all(float(metrics[f"ambiguous_labels/{name}"]) == 0 for name in tn34.chain.names)
 
 
 def test_training_learns(root, tn34, tmp_path):

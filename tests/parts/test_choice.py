@@ -205,7 +205,9 @@ def test_the_frame_of_a_choice_is_a_rotation_with_the_direction_as_z(direction):
     torch.testing.assert_close(frame[2], along, atol=1e-12, rtol=0)
 
 
-@pytest.mark.parametrize("direction", [(0.0, 0.0, 0.0), (0.0, 1.0), (math.nan, 0.0, 1.0), (0.0, math.inf, 1.0)])
+@pytest.mark.parametrize(
+    "direction", [(0.0, 0.0, 0.0), (0.0, 1.0), (math.nan, 0.0, 1.0), (0.0, math.inf, 1.0)]
+)
 def test_a_choice_without_a_direction_is_refused(direction):
     with pytest.raises(ValueError, match=r"targets.direction is \(.*expected three numbers"):
         KeypointChoice(direction=direction)

@@ -134,7 +134,7 @@ def test_one_keypoint_beside_the_line_is_enough():
 
 def test_keypoints_in_a_plane_that_the_mirror_moves_are_refused():
     """face and side lie in the zx plane; a mirror across x moves them, one across y leaves them."""
-    with refused("the keypoints lie in one plane with the centroid, so a part and its mirror image look the same"):
+    with refused("the keypoints lie in one plane with the centroid, so a part and its mirror image"):
         KeypointChain([FACE, SIDE], "hw", cyclic(1), reflection((1, 0, 0)))
     KeypointChain([FACE, SIDE], "hw", cyclic(1), reflection((0, 1, 0)))
     off = Keypoint("off", "centroid", Plane("y"), "h")
@@ -171,7 +171,7 @@ def test_nothing_hangs_on_a_sphere():
 
 @pytest.mark.parametrize(("sides", "n", "count"), [(4, 6, 6), (6, 4, 4), (3, 6, 6)])
 def test_a_polygon_with_other_sides_than_the_symmetry_makes_is_refused(sides, n, count):
-    with refused(f"keypoint 'vertex': the part's symmetry makes {count} equivalents .* polygon of {sides} sides"):
+    with refused(f"keypoint 'vertex': .* makes {count} equivalents .* polygon of {sides} sides"):
         KeypointChain([FACE, Keypoint("vertex", "face", Polygon(sides), "d")], "hd", dihedral(n))
 
 

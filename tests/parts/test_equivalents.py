@@ -69,7 +69,8 @@ def test_the_length_of_a_step_does_not_matter():
 
 
 def test_images_are_matrix_times_vector():
-    vectors, group = torch.randn(4, 5, 3, generator=torch.Generator().manual_seed(0)).double(), cyclic(3).rotations
+    group = cyclic(3).rotations
+    vectors = torch.randn(4, 5, 3, generator=torch.Generator().manual_seed(0)).double()
     carried = images_of(vectors, group)
     assert carried.shape == (4, 5, 3, 3)
     for q in range(3):

@@ -38,8 +38,11 @@ def test_an_expression_has_its_value_in_millimetres(expression, millimetres):
     assert float(length(expression, NAMES, SIZE)) == pytest.approx(millimetres / 1000, rel=1e-12)
 
 
+PLAIN = ["r+h", "r-2*h", "r/h", "3*(r-h)/r", "max(r,h)-min(h,r)"]
+
+
 @settings(max_examples=40, deadline=None)
-@given(st.floats(1, 100), st.floats(1, 100), st.sampled_from(["r+h", "r-2*h", "r/h", "3*(r-h)/r", "max(r,h)-min(h,r)"]))
+@given(st.floats(1, 100), st.floats(1, 100), st.sampled_from(PLAIN))
 def test_expressions_agree_with_python(r, h, expression):
     found = 1000 * float(length(expression, NAMES, np.array([r, h]) / 1000))
     expected = eval(expression, {"__builtins__": {}}, {"r": r, "h": h, "max": max, "min": min})
@@ -126,7 +129,10 @@ def test_anything_but_arithmetic_is_refused(expression):
         holds(expression, NAMES, SIZE)
 
 
-@pytest.mark.parametrize("text", ["", " ", "r +", "2 r", "r; h", "r = 2", "import os", "r\nh", "(r", "0x", "r #\n +", "((("])
+BROKEN = ["", " ", "r +", "2 r", "r; h", "r = 2", "import os", "r\nh", "(r", "0x", "r #\n +", "((("]
+
+
+@pytest.mark.parametrize("text", BROKEN)
 def test_what_is_no_expression_at_all_is_refused(text):
     with pytest.raises(ValueError, match="is no expression; write for example"):
         check_expression(text, NAMES)
@@ -145,7 +151,7 @@ def test_the_number_of_a_functions_values_is_checked(expression, wanted):
 
 @pytest.mark.parametrize("condition", ["r", "r + h", "3"])
 def test_a_condition_must_compare(condition):
-    with pytest.raises(ValueError, match=f"'{condition}' compares nothing; write for example 'd > r'".replace("+", r"\+")):
+    with pytest.raises(ValueError, match="compares nothing; write for example 'd > r'"):
         holds(condition, NAMES, SIZE)
 
 
@@ -153,3 +159,21 @@ def test_evaluating_leaves_the_parameters_alone():
     size = SIZE.copy()
     length("-r + h", NAMES, size)
     assert np.array_equal(size, SIZE)
+
+
+@pytest.mark.parametrize("expression", ["r > 2", "(r > 2) + 1", "-(r > 2)", "min(r > 2, h)"])
+def test_a_comparison_is_no_length(expression):
+    with pytest.raises(ValueError):
+        check_expression(expression, NAMES)
+
+
+@pytest.mark.parametrize("expression", ["1 / 0", "r / 0", "h / (r - r)", "sqrt(-1)", "1e400", "9" * 400])
+def test_a_length_that_is_no_finite_number_is_refused(expression):
+    with np.errstate(all="ignore"), pytest.raises(ValueError):
+        length(expression, NAMES, SIZE)
+
+
+@pytest.mark.parametrize("expression", ["-" * 5000 + "r", "r + " * 5000 + "r"])
+def test_an_expression_of_endless_depth_is_refused(expression):
+    with pytest.raises(ValueError):
+        check_expression(expression, NAMES)

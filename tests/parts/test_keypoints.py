@@ -12,7 +12,7 @@ from pnet.geometry.rigid import apply_pose
 from pnet.geometry.symmetry import RevolutionSymmetry, SphericalSymmetry, cyclic, dihedral, reflection
 from pnet.parts.choice import KeypointChoice, KeypointRule, NearestToCamera, NearestToPoint
 from pnet.parts.keypoints import Keypoint, KeypointChain, cone_keypoints, select_keypoints
-from pnet.parts.primitives import Circle, Corner, Cylinder, Plane, Polygon, Sphere
+from pnet.parts.primitives import Circle, Corner, Cylinder, Plane, Sphere
 
 CHOICES = {
     "equation 1": KeypointChoice(),
@@ -61,9 +61,10 @@ def test_batch_dimensions_and_dtype_are_kept(chain, choice, rotations, sizes):
     single, lead = chain.select(choice, parameters.float().reshape(2, 3, k), R.float().reshape(2, 3, 3, 3))
     assert single.shape == (2, 3, m, 3) and lead.shape == (2, 3, m)
     assert single.dtype == lead.dtype == torch.float32
-    one_by_one = [chain.select(choice, p, r) for p, r in zip(parameters, R, strict=True)]
-    torch.testing.assert_close(single.flatten(0, 1).double(), torch.stack([p for p, _ in one_by_one]), atol=1e-7, rtol=0)
-    torch.testing.assert_close(lead.flatten(0, 1).double(), torch.stack([q for _, q in one_by_one]), atol=1e-7, rtol=0)
+    for i in range(6):
+        alone, margin = chain.select(choice, parameters[i], R[i])
+        torch.testing.assert_close(single[i // 3, i % 3].double(), alone, atol=1e-7, rtol=0)
+        torch.testing.assert_close(lead[i // 3, i % 3].double(), margin, atol=1e-7, rtol=0)
 
 
 def test_points_of_one_instance_share_its_template(chain, sizes):
@@ -92,7 +93,8 @@ def test_the_mean_stands_where_several_keypoints_measure_one_parameter():
 
 def test_a_cone_is_measured_from_its_base():
     """Base centre 3 below the centroid, radius 2, height 12: the rule breaks the apex angle in two."""
-    keypoints = [Keypoint("base", "centroid", Plane("-z", at=0)), *cone_keypoints("rim", "tip", "base", "z", "r", "h")]
+    base = Keypoint("base", "centroid", Plane("-z", at=0))
+    keypoints = [base, *cone_keypoints("rim", "tip", reference="base", axis="z", radius="r", height="h")]
     chain = KeypointChain(
         keypoints, ["r", "h"], RevolutionSymmetry(), None, lambda p: p[:, 1:] / 4 * np.array([[0, 0, 1]])
     )
@@ -109,7 +111,8 @@ def test_a_corner_stands_where_it_is_declared_less_the_centroid():
         Keypoint("end", "centroid", Plane("x"), "a"),
         Keypoint("top", "centroid", Plane("z"), "a"),
     ]
-    chain = KeypointChain(keypoints, ["a"], cyclic(1), None, lambda p: np.tile([0.001, 0.002, 0.003], (len(p), 1)))
+    centroid = [0.001, 0.002, 0.003]
+    chain = KeypointChain(keypoints, ["a"], cyclic(1), None, lambda p: np.tile(centroid, (len(p), 1)))
     corner, foot, _, _ = chain.canonical(torch.tensor([[0.010], [0.020]]).double()).unbind(-2)
     assert corner.flatten().tolist() == pytest.approx([0.004, 0.001, -0.013, 0.009, 0.001, -0.023])
     assert foot.flatten().tolist() == pytest.approx([0, -0.003, 0] * 2)  # the plane y = -1 mm
@@ -140,7 +143,8 @@ def test_finite_labels_are_the_template_turned_and_seen_through_one_chirality(ch
 
 
 @pytest.mark.parametrize(
-    ("name", "count"), [("nut", 1), ("nut with mirror", 1), ("wedge", 2), ("lug", 1), ("antiprism with inversion", 1)]
+    ("name", "count"),
+    [("nut", 1), ("nut with mirror", 1), ("wedge", 2), ("lug", 1), ("antiprism with inversion", 1)],
 )
 def test_a_mirror_makes_a_second_structure_only_where_it_moves_the_keypoints(declare, name, count):
     """A nut's mirror does what its half turns do: its label keypoints lie in a mirror plane of the nut."""
@@ -197,7 +201,9 @@ def test_turning_back_undoes_every_free_choice(chain, rotations, sizes):
 
 
 def test_turning_back_keeps_a_nuts_side_and_vertex(declare):
-    labels = torch.tensor([[0, 0, -0.005], [-0.0024, 0.0032, -0.005], [-0.012, 0, -0.005]], dtype=torch.float64)
+    labels = torch.tensor(
+        [[0, 0, -0.005], [-0.0024, 0.0032, -0.005], [-0.012, 0, -0.005]], dtype=torch.float64
+    )
     back = declare("nut").turn_back(labels)
     assert torch.equal(back[[0, 2]], labels[[0, 2]])
     assert back[1].tolist() == pytest.approx([0.004, 0, -0.005])

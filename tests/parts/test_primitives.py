@@ -1,6 +1,7 @@
 """Where the second keypoint lies on each primitive, and how free it is."""
 
 import math
+import re
 
 import pytest
 from hypothesis import given, settings
@@ -39,11 +40,14 @@ def test_three_numbers_are_a_direction_of_any_length(vector):
 
 @pytest.mark.parametrize("name", ["w", "--z", "", "zz", "+x"])
 def test_an_unknown_axis_is_named(name):
-    with pytest.raises(ValueError, match=f"direction {name!r}: choose x, y, z, -x, -y, -z or".replace("+", r"\+")):
+    with pytest.raises(ValueError, match=re.escape(f"direction {name!r}: choose x, y, z, -x, -y, -z or")):
         unit(name)
 
 
-@pytest.mark.parametrize("vector", [(0.0, 0.0, 0.0), (1.0, 0.0), (math.nan, 0.0, 1.0), (math.inf, 0.0, 0.0)])
+NO_DIRECTIONS = [(0.0, 0.0, 0.0), (1.0, 0.0), (math.nan, 0.0, 1.0), (math.inf, 0.0, 0.0)]
+
+
+@pytest.mark.parametrize("vector", NO_DIRECTIONS)
 def test_numbers_that_are_no_direction_are_refused(vector):
     with pytest.raises(ValueError, match="expected three finite numbers, not all zero"):
         unit(vector)

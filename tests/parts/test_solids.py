@@ -29,7 +29,7 @@ SECTIONS = 24
 L_SHAPE = np.array([[0.0, 0], [4, 0], [4, 1], [1, 1], [1, 3], [0, 3]])  # area 6
 SHAPES: dict[str, Shape] = {
     "box": box((-1.0, 2.0), (0.5, 1.0), (3.0, 5.0)),
-    "hexagonal prism": prism(polygon(6, 1.5) + [0.3, -0.2], -1.0, 2.0),
+    "hexagonal prism": prism(polygon(6, 1.5) + np.array([0.3, -0.2]), -1.0, 2.0),
     "L profile": Extrusion(L_SHAPE, 0.5, 2.0),
     "cylinder": cylinder(1.5, -1.0, 2.0),
     "frustum": cone(2.0, 0.5, 1.0, 4.0),
@@ -137,7 +137,9 @@ def test_many_sizes_at_once_equal_one_by_one():
         plate = prism(polygon(6, 3 * r), 0.0, h)
         foot = moved(box((-r / 2, r), (-r, 0.0 * r), (-h, 0.0 * h)), "x", (h, -0.5, r + h))
         knob = moved(Ball(r / 3), "y", (0.0, r, 2.0))
-        return (plate | foot | knob | cone(r, 0.0, h, 3 * h)) - hole(moved(cylinder(r / 4, 0.0, h), at=(r, h, 0.0)))
+        return (plate | foot | knob | cone(r, 0.0, h, 3 * h)) - hole(
+            moved(cylinder(r / 4, 0.0, h), at=(r, h, 0.0))
+        )
 
     volume, moment = make(r, h).signed_volume_and_moment(SECTIONS)
     assert volume.shape == (2, 3) and moment.shape == (2, 3, 3)
@@ -217,7 +219,9 @@ def test_a_polygon_is_counter_clockwise_from_x():
     assert outline[0].tolist() == [2, 0]
     np.testing.assert_allclose(np.linalg.norm(outline, axis=1), 2, rtol=1e-15)
     x, y = outline.T
-    assert (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2 == pytest.approx(polygon_area(2.0, 12), rel=1e-14)
+    assert (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2 == pytest.approx(
+        polygon_area(2.0, 12), rel=1e-14
+    )
     assert polygon(6, np.ones((2, 3))).shape == (2, 3, 6, 2)
 
 

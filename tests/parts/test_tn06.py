@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from pnet.parts.choice import KeypointChoice
 from pnet.parts.tn06 import TN06
 
 SECTIONS = 48
@@ -92,3 +93,23 @@ def test_a_hole_just_inside_the_hexagon_makes_a_solid():
     part = TN06(grid, grid)
     mesh = part.mesh(part.part_object("L", 0))
     assert mesh.is_watertight and mesh.volume > 0
+
+
+def test_hole_and_vertex_of_the_labels_lie_on_the_face_nearest_to_the_camera(tn06, rotations):
+    R = rotations(50)
+    parameters = torch.tensor([0.0055, 0.014, 0.016], dtype=torch.float64).expand(50, 3)
+    labels, _ = tn06.chain.select(KeypointChoice(), parameters, R)
+    side = -0.007 * R[:, 2, 2].sign()
+    torch.testing.assert_close(labels[..., 2], side[:, None].expand(50, 3))
+    face, hole, vertex = (labels @ R.mT)[..., 2].unbind(-1)
+    assert (hole < face).all() and (vertex < hole + 1e-12).sum() > 40  # the vertex lies farther out
+    corners = torch.tensor(
+        [[0.016 * math.cos(i * math.pi / 3), 0.016 * math.sin(i * math.pi / 3)] for i in range(6)]
+    ).double()
+    nearest = (corners @ R[:, 2, :2].T).argmin(0)
+    torch.testing.assert_close(labels[:, 2, :2], corners[nearest])
+
+
+def test_its_mirror_planes_add_no_second_structure(tn06):
+    assert len(tn06.chain.chiralities) == 1 and tn06.mirror is None
+    assert tn06.chain.is_finite == [True, False, True]

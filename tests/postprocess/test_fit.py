@@ -9,8 +9,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from pnet.geometry.rigid import apply_pose, axis_angle_between
-from pnet.geometry.symmetry import RevolutionSymmetry, SphericalSymmetry
+from pnet.geometry.symmetry import RevolutionSymmetry, SphericalSymmetry, cyclic
 from pnet.parts.choice import KeypointChoice, KeypointRule, NearestToPoint
+from pnet.parts.keypoints import Keypoint, KeypointChain
+from pnet.parts.primitives import Plane
 from pnet.postprocess.fit import fit_pose
 
 CAMERA, CANONICAL, POINT = KeypointRule.CAMERA, KeypointRule.CANONICAL, KeypointRule.POINT
@@ -112,6 +114,27 @@ def test_one_chirality_alone_fails_for_the_mirrored_half(brick, random_poses, ra
     found_R, _ = fit_pose(Half(), sizes, t, keypoints)
     assert error_modulo(brick.symmetry, found_R[~mirrored], R[~mirrored]) < 1e-6
     assert math.degrees(error_modulo(brick.symmetry, found_R[mirrored], R[mirrored])) > 10
+
+
+def test_the_mirror_may_be_a_turn_and_a_reflection_in_one(random_poses, random_sizes, error_modulo):
+    """A quarter turn about z with z turned round, which is not its own inverse."""
+    screw = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, -1]], dtype=torch.float64)
+    keypoints = [
+        Keypoint("tip", "centroid", Plane((1.0, 0.3, 0.8)), "a"),
+        Keypoint("fin", "centroid", Plane((-0.2, 1.0, 0.1)), "b"),
+        Keypoint("face", "centroid", Plane("z"), "c"),
+    ]
+    chain = KeypointChain(keypoints, ("a", "b", "c"), cyclic(2), screw)
+    assert len(chain.group) == 4 and len(chain.chiralities) == 2
+    R, t = random_poses(100)
+    sizes = torch.tensor([0.02, 0.03, 0.01], dtype=torch.float64).expand(100, 3)
+    for choice in CHOICES:
+        local = chain.choose(NearestToPoint(PLACES[torch.arange(100) % 4]), chain.canonical(sizes))[0]
+        if choice.rule is not POINT:
+            local = chain.select(choice, sizes, R)[0]
+        found_R, found_t = fit_pose(chain, sizes, t, apply_pose(R, t, local))
+        assert error_modulo(cyclic(2), found_R, R) < 1e-6
+        torch.testing.assert_close(found_t, t, rtol=0, atol=1e-9)
 
 
 def test_an_outlier_of_little_weight_does_not_move_the_pose(part, random_poses, random_sizes, error_modulo):

@@ -4,6 +4,8 @@ import math
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from pnet.geometry.rigid import apply_pose
@@ -121,6 +123,18 @@ def test_a_fold_carries_every_equivalent_to_the_templates_place(any_part, random
         torch.testing.assert_close(fold(any_part.chain, template, turned)[0], template.expand(18, -1, 3))
 
 
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_which_equivalent_a_noisy_vote_means_does_not_matter(any_part, random_sizes, seed):
+    chain, generator = any_part.chain, torch.Generator().manual_seed(seed)
+    template = chain.canonical(random_sizes(any_part, 3, seed))
+    noise = torch.randn(3, 20, len(chain), 3, generator=generator, dtype=torch.float64)
+    local = template[:, None] + 0.0005 * noise
+    element = chain.group[torch.randint(len(chain.group), (3, 20), generator=generator)]
+    folded = fold(chain, template, local @ element.mT)
+    torch.testing.assert_close(folded, fold(chain, template, local), rtol=0, atol=1e-12)
+
+
 def test_a_fold_leaves_a_votes_error_as_large_as_it_was(tn42, random_sizes):
     """A bar's mirror image, 2 mm off: after the fold the error is mirrored too."""
     template = tn42.chain.canonical(random_sizes(tn42, 1))
@@ -163,6 +177,18 @@ def test_members_by_hand():
     assert valid.tolist() == [[True, True, False], [True] * 3, [True, False, False]]
     assert members(torch.tensor([1, 0, 1]), 2, 1)[0].tolist() == [[1], [0]]
     assert members(torch.tensor([0, 0]), 1, 50)[0].tolist() == [[0, 1]]  # no wider than the largest
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10**6), d=st.integers(1, 5), most=st.integers(1, 12))
+def test_members_against_one_cluster_at_a_time(seed, d, most):
+    generator = torch.Generator().manual_seed(seed)
+    owner = torch.cat([torch.arange(d), torch.randint(-1, d, (30,), generator=generator)])
+    index, valid = members(owner, d, most)
+    for c in range(d):
+        own = torch.nonzero(owner == c).squeeze(1)[:most].tolist()
+        assert index[c, valid[c]].tolist() == own
+        assert set(index[c, ~valid[c]].tolist()) <= {own[0]}
 
 
 def test_the_location_by_hand():

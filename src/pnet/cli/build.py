@@ -12,7 +12,9 @@ from pnet.cli.instantiate import instantiate
 from pnet.data.module import SceneDataModule
 from pnet.models.parametricnet import ParametricNet
 from pnet.parts.base import ParametricPart
+from pnet.parts.choice import KeypointRule
 from pnet.postprocess.pipeline import PoseRecovery
+from pnet.postprocess.vote import MeanVote
 
 if TYPE_CHECKING:
     from pnet.engine.estimator import NetworkEstimator
@@ -34,9 +36,15 @@ def build_parts(cfg: DictConfig) -> Parts:
     """Part, network and recovery of a config; the network's weights are drawn from its seed."""
     torch.manual_seed(cfg.seed)
     part: ParametricPart = instantiate(cfg.part)
+    recovery: PoseRecovery = instantiate(cfg.postprocess)
+    if cfg.data.targets.rule == KeypointRule.POINT and isinstance(recovery.voting, MeanVote):
+        raise ValueError(
+            "data.targets.rule=point teaches the points of a body different equivalents of a keypoint, and "
+            "postprocess.voting takes plain means of them: use postprocess=folded"
+        )
     backbone = instantiate(cfg.backbone)
     network = instantiate(cfg.model, backbone=backbone, keypoints=len(part.chain))
-    return Parts(part, network.to(memory_format=torch.channels_last), instantiate(cfg.postprocess))
+    return Parts(part, network.to(memory_format=torch.channels_last), recovery)
 
 
 def build_data(cfg: DictConfig, part: ParametricPart) -> SceneDataModule:

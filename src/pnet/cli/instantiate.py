@@ -40,8 +40,8 @@ def instantiate(node: DictConfig, *args: Any, **kwargs: Any) -> Any:
 def allowed() -> tuple[str, ...]:
     """The prefixes that targets may have: pnet's own, and modules that the user names in the environment.
 
-    A config cannot extend it: whoever starts the command decides whose code runs. Such modules are also looked for in
-    the working directory.
+    A config cannot extend it: whoever starts the command decides whose code runs. Such modules are also
+    looked for in the working directory.
     """
     named = [word.strip() for word in os.environ.get(TRUSTED, "").split(",") if word.strip()]
     if named and os.getcwd() not in sys.path:

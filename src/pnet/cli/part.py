@@ -73,7 +73,9 @@ def part_checks(part: "ParametricPart", samples: int) -> Iterator["Check"]:
     for rule in KeypointRule:
         angle, distance = fit_error(part, rule, samples)
         name = f"exact keypoints give the pose back, rule {rule}"
-        yield Check(name, angle < 1e-6 and distance < 1e-9, f"{angle:.1e} rad, {1000 * distance:.1e} mm at most")
+        yield Check(
+            name, angle < 1e-6 and distance < 1e-9, f"{angle:.1e} rad, {1000 * distance:.1e} mm at most"
+        )
 
 
 def write_mesh(mesh: Any, path: Path) -> None:
@@ -83,7 +85,9 @@ def write_mesh(mesh: Any, path: Path) -> None:
     try:
         content = mesh.export(file_type=path.suffix.removeprefix("."))
     except (ValueError, KeyError) as fault:
-        raise ValueError(f"formats: cannot write {path.name} ({fault}); choose among stl, obj, glb, ply") from fault
+        raise ValueError(
+            f"formats: cannot write {path.name} ({fault}); choose among stl, obj, glb, ply"
+        ) from fault
     write_atomically(path, content.encode() if isinstance(content, str) else content)
 
 

@@ -23,7 +23,8 @@ def instance_keypoints(scene: Scene, chain: KeypointChain, choice: KeypointChoic
 
 
 def nearest_keypoints(scene: Scene, chain: KeypointChain) -> tuple[Tensor, Tensor]:
-    """For every surface point the equivalent keypoints of its instance that are nearest to it (`KeypointRule.POINT`).
+    """For every surface point the equivalent keypoints of its instance that are nearest to it
+    (`KeypointRule.POINT`).
 
     Args:
         scene: N points on d instances. chain: the part's keypoints.

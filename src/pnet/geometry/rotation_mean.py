@@ -14,9 +14,9 @@ ROUNDS = 12  # of re-weighting
 def mean_rotation(R: Tensor, weight: Tensor, symmetry: Symmetry, width: float) -> Tensor:
     """The rotation on which most hypotheses agree, up to the symmetry.
 
-    Hypotheses that differ by symmetry elements agree. Each is brought to the equivalent nearest to the current
-    mean (so nothing is averaged across elements), weighted by how near that is, and averaged in the chordal
-    metric; the climb starts at several hypotheses and the one with the most support wins.
+    Hypotheses that differ by symmetry elements agree. Each is brought to the equivalent nearest to the
+    current mean (so nothing is averaged across elements), weighted by how near that is, and averaged in the
+    chordal metric; the climb starts at several hypotheses and the one with the most support wins.
 
     Args:
         R: (..., n, 3, 3) hypotheses, part → camera. weight: (..., n) trust, non-negative, some positive.

@@ -139,7 +139,9 @@ def nearest_equivalent(R: Tensor, reference: Tensor, symmetry: Symmetry) -> Tens
             if not reflected:
                 return turned
             flipped = _turn_nearest(R @ torch.tensor(FLIP).to(R), reference)
-            nearer = (flipped[..., 2] * reference[..., 2]).sum(-1) > (turned[..., 2] * reference[..., 2]).sum(-1)
+            nearer = (flipped[..., 2] * reference[..., 2]).sum(-1) > (turned[..., 2] * reference[..., 2]).sum(
+                -1
+            )
             return torch.where(nearer[..., None, None], flipped, turned)
         case _:
             return reference

@@ -8,7 +8,6 @@ from torch import Tensor
 from pnet.parts.keypoints import KeypointChain
 from pnet.records import Batch, PointPrediction
 
-
 AMBIGUOUS = 1e-3  # metres: a label whose runner-up is nearer than this may well have been the other one
 
 
@@ -26,8 +25,8 @@ class ParametricLoss:
     Args:
         chain: the part's keypoints, for M_P.
         norm: for centroids and keypoints.
-        margin: metres; a keypoint label that is no better than its runner-up by much more than this counts less, by
-            margin_of_label / (margin_of_label + margin). None: every label counts alike.
+        margin: metres; a keypoint label that is no better than its runner-up by much more than this counts
+            less, by margin_of_label / (margin_of_label + margin). None: every label counts alike.
         centroid, keypoints, parameters, visibility: the weights λ; None takes the paper's default,
             λ_MC = 200, λ_MKP = 200 / 3m, λ_MP = 50 / k, λ_MV = 50.
     """

@@ -23,14 +23,18 @@ Grid = Mapping[str, Sequence[float]]
 class ParametricPart(ABC):
     """A shape template; a part object is the template with parameter values.
 
-    A subclass declares the class attributes and the solid; everything else follows. The solid may be built about
-    any origin (the frame of construction); the part frame has the same axes and its origin at the volume centroid.
+    A subclass declares the class attributes and the solid; everything else follows. The solid may be built
+    about any origin (the frame of construction); the part frame has the same axes and its origin at the
+    volume centroid.
 
     Attributes:
         name: the template's name. parameter_names: (k) in the order of every parameter array.
         keypoints: the declaration from which labels, parameters and the fit follow.
         symmetry: proper rotations that leave the part unchanged; a revolution's axis is z.
         mirror: (3, 3) an improper symmetry, or None; only where no proper one does the same to the keypoints.
+        closed_form_centroid: whether the centroid is the signed sum of the shapes' own; None: find out with
+            the first and last part objects. False where shapes overlap, or are cut beyond their borders, for
+            some sizes only.
         is_fixed: all bodies have the same, known sizes, so estimates take them from the part.
     """
 
@@ -39,6 +43,7 @@ class ParametricPart(ABC):
     keypoints: tuple[Keypoint, ...]
     symmetry: Symmetry
     mirror: Tensor | None = None
+    closed_form_centroid: bool | None = None
     is_fixed: bool = False
 
     def __init__(
@@ -50,9 +55,12 @@ class ParametricPart(ABC):
         """
         Args:
             learning: parameter → values in mm; all combinations are the part objects of the training
-                set and of the L-dataset. generalization: the same for the G-dataset; None where there is none.
+                set and of the L-dataset. generalization: the same for the G-dataset; None where there is
+                none.
             sections: polygon sides that stand for a circle in the mesh.
         """
+        if len(set(self.parameter_names)) < len(self.parameter_names):
+            raise ValueError(f"{self.name}: a parameter name comes twice in {list(self.parameter_names)}")
         if sections < 6 or sections % 6:
             raise ValueError(f"{self.name}: sections is {sections}, expected a multiple of 6")
         self.sections = sections
@@ -82,7 +90,7 @@ class ParametricPart(ABC):
                 `r, h = self.split(parameters)`, each (...).
         """
 
-    def check(self, parameters: Points) -> None:
+    def check(self, parameters: Points) -> None:  # noqa: B027  most parts have nothing to refuse
         """Raise ValueError where values make no valid solid, with the reason. parameters: (k,) metres."""
 
     def split(self, parameters: Points) -> list[Points]:
@@ -95,15 +103,26 @@ class ParametricPart(ABC):
         Raises:
             ValueError: where it vanishes or falls apart.
         """
+        mesh, centroid = self._construct(parameters), self.centroid(parameters[None])[0]
+        if mesh.body_count > 1:
+            raise ValueError(
+                f"{self.name}: the solid falls into {mesh.body_count} pieces with {self.text(parameters)}; "
+                "a cut goes through it, or added shapes don't touch"
+            )
+        if self.closed_form and np.abs(mesh.center_mass - centroid).max() > 1e-6 * mesh.scale:
+            raise ValueError(
+                f"{self.name}: shapes overlap, or are cut beyond their borders, with "
+                f"{self.text(parameters)}, though not with the first part object; "
+                "set closed_form_centroid = False"
+            )
+        return mesh.apply_translation(-centroid)
+
+    def _construct(self, parameters: Points) -> trimesh.Trimesh:
+        """The mesh in the frame of construction."""
         mesh = solid(self.solid(parameters)).mesh(self.sections)
         if len(mesh.faces) == 0 or mesh.volume <= 0:
             raise ValueError(f"{self.name}: nothing is left of the solid with {self.text(parameters)}")
-        if mesh.body_count > 1:
-            raise ValueError(
-                f"{self.name}: the solid falls into {mesh.body_count} pieces with {self.text(parameters)}; a cut goes "
-                "through it, or added shapes don't touch"
-            )
-        return mesh.apply_translation(-self.centroid(parameters[None])[0])
+        return mesh
 
     def convex_pieces(self, parameters: Points, fill_holes: bool) -> list[Points]:
         """Corner points of convex pieces for collision, in the part frame.
@@ -124,27 +143,30 @@ class ParametricPart(ABC):
         Args:
             parameters: (n, k) metres.
         Returns:
-            (n, 3) metres: of the mesh's polyhedron, exactly; in closed form where shapes neither overlap nor are
-            cut beyond their borders, else from the mesh.
+            (n, 3) metres: of the mesh's polyhedron, exactly; in closed form where shapes neither overlap nor
+            are cut beyond their borders, else from the mesh.
         """
-        if not self._in_closed_form:
+        if not self.closed_form:
             return np.stack([self._mesh_centroid(tuple(row)) for row in parameters.tolist()])
         volume, moment = solid(self.solid(parameters)).signed_volume_and_moment(self.sections)
         centroid = moment / volume[..., None]
         return np.broadcast_to(centroid, (len(parameters), 3))
 
     @cached_property
-    def _in_closed_form(self) -> bool:
-        for row in self.grids["L"][[0, -1]]:
-            body = solid(self.solid(row))
-            volume, _ = body.signed_volume_and_moment(self.sections)
-            if abs(float(volume) / body.mesh(self.sections).volume - 1) > 1e-6:
-                return False
-        return True
+    def closed_form(self) -> bool:
+        """Whether `centroid` is a signed sum, see `closed_form_centroid`."""
+        if self.closed_form_centroid is not None:
+            return self.closed_form_centroid
+        ends = np.unique([grid[i] for grid in self.grids.values() for i in (0, -1)], axis=0)
+        return all(self._adds_up(row) for row in ends)
+
+    def _adds_up(self, parameters: Points) -> bool:
+        volume, _ = solid(self.solid(parameters)).signed_volume_and_moment(self.sections)
+        return bool(abs(float(volume) / self._construct(parameters).volume - 1) < 1e-6)
 
     @lru_cache(maxsize=4096)  # noqa: B019  a part lives as long as its process
     def _mesh_centroid(self, parameters: tuple[float, ...]) -> Points:
-        return np.asarray(solid(self.solid(np.array(parameters))).mesh(self.sections).center_mass)
+        return np.asarray(self._construct(np.array(parameters)).center_mass)
 
     def part_object(self, grid: str, index: int) -> Points:
         """Parameters of a part object.
@@ -194,11 +216,11 @@ class ParametricPart(ABC):
         for parameters in grid:
             self.check_named(parameters)
         for _, shape in solid(self.solid(grid)).steps:
-            volume = np.broadcast_to(shape.volume_and_moment(self.sections)[0], len(grid))
-            if (volume <= 0).any():
-                text = self.text(grid[int(volume.argmin())])
+            valid = np.broadcast_to(shape.is_valid(self.sections), len(grid))
+            if not valid.all():
                 raise ValueError(
-                    f"{self.name}: a {type(shape).__name__.lower()} of the solid vanishes or turns inside out with {text}"
+                    f"{self.name}: the solid's {type(shape).__name__.lower()} vanishes or turns inside out "
+                    f"with {self.text(grid[int(valid.argmin())])}"
                 )
 
     def _grid(self, key: str, values: Grid) -> Points:

@@ -1,7 +1,8 @@
-"""A part of fixed size from a CAD mesh: bounding primitives make it a parametric part of one size (Section III.A).
+"""A part of fixed size from a CAD mesh: bounding primitives make it a parametric part of one size (Section
+III.A).
 
-"A non-parametric object can be converted into a part object from a shape template consisting of several simple bounding
-primitives": the parameters are the sizes of those, all of one value.
+"A non-parametric object can be converted into a part object from a shape template consisting of several
+simple bounding primitives": the parameters are the sizes of those, all of one value.
 """
 
 from __future__ import annotations
@@ -31,11 +32,12 @@ class CadPart(ParametricPart):
     """A mesh with bounding primitives.
 
     Args:
-        name: the template's name. mesh: a watertight .stl, .obj, .ply, .off or .glb; its coordinates are the frame of
-            construction, its symmetry axis z. unit: mm, cm, m or inch.
-        bounds: "cuboid" (sizes l, w, h along x, y, z, one corner as reference), "cylinder" (r, h about z), "sphere" (r);
-            used where no keypoints are given.
-        keypoints, sizes: a declaration of one's own as in `DeclaredPart`, and the value of every parameter, mm.
+        name: the template's name. mesh: a watertight .stl, .obj, .ply, .off or .glb; its coordinates are the
+            frame of construction, its symmetry axis z. unit: mm, cm, m or inch.
+        bounds: "cuboid" (sizes l, w, h along x, y, z, one corner as reference), "cylinder" (r, h about z),
+            "sphere" (r); used where no keypoints are given.
+        keypoints, sizes: a declaration of one's own as in `DeclaredPart`, and the value of every parameter,
+            mm.
         symmetry, mirror: as in `DeclaredPart`.
         collision: "hull" or "coacd" (convex pieces by the package coacd) for physics.
     """
@@ -63,7 +65,9 @@ class CadPart(ParametricPart):
         else:
             chosen = tuple(keypoint_from(key, fields) for key, fields in keypoints.items())
             if sizes is None:
-                raise ValueError(f"{name}: give sizes: with the value in mm of every parameter that keypoints measure")
+                raise ValueError(
+                    f"{name}: give sizes: with the value in mm of every parameter that keypoints measure"
+                )
             found = {key: value / 1000 for key, value in sizes.items()}
         self.keypoints, self.parameter_names = chosen, tuple(found)
         super().__init__({key: [1000 * value] for key, value in found.items()}, None, sections)
@@ -127,10 +131,13 @@ def read_mesh(path: Path, unit: str) -> trimesh.Trimesh:
         raise ValueError(f"{path}: holds no triangles")
     mesh.merge_vertices()
     if not mesh.is_watertight:
-        raise ValueError(f"{path}: the mesh is not watertight; close its gaps in a CAD program or with trimesh.repair")
+        raise ValueError(
+            f"{path}: the mesh is not watertight; close its gaps in a CAD program or with trimesh.repair"
+        )
     if mesh.volume < 0:
         mesh.invert()
-    return mesh.apply_scale(UNITS[unit])
+    mesh.apply_transform(np.diag([UNITS[unit]] * 3 + [1.0]))
+    return mesh
 
 
 def bounding_keypoints(
@@ -143,14 +150,14 @@ def bounding_keypoints(
     Returns:
         keypoints, and parameter → metres.
     """
-    low, high = (1000 * corner for corner in mesh.bounds)
+    low = (1000 * mesh.bounds[0]).tolist()
     length, width, height = (mesh.bounds[1] - mesh.bounds[0]).tolist()
     wanted = {RevolutionSymmetry: "cylinder", SphericalSymmetry: "sphere"}.get(type(symmetry), bounds)
     if bounds != wanted:
         raise ValueError(f"bounds is {bounds!r}, but the symmetry asks for {wanted!r}")
     match bounds:
         case "cuboid":
-            corner = Corner((float(low[0]), float(low[1]), float(low[2])))
+            corner = Corner((low[0], low[1], low[2]))
             ends = zip(("x", "y", "z"), ("l", "w", "h"), strict=True)
             chosen = [Keypoint(f"{axis}_end", "corner", Plane(axis), size) for axis, size in ends]
             return (Keypoint("corner", "centroid", corner), *chosen), {"l": length, "w": width, "h": height}
@@ -159,9 +166,10 @@ def bounding_keypoints(
             off = float(np.linalg.norm(mesh.center_mass[:2]))
             if off > 0.01 * radius:
                 raise ValueError(
-                    f"the mesh's centroid lies {1000 * off:.2g} mm off its z axis: move the mesh so that z is its axis"
+                    f"the mesh's centroid lies {1000 * off:.2g} mm off its z axis: "
+                    "move the mesh so that z is its axis"
                 )
-            base = Plane("-z", at=float(-low[2]))
+            base = Plane("-z", at=-low[2])
             found = (Keypoint("base", "centroid", base), Keypoint("top", "base", Plane("z"), "h"))
             return (*found, Keypoint("rim", "base", Circle("z"), "r")), {"h": height, "r": radius}
         case "sphere":

@@ -1,7 +1,7 @@
 """Candlestick: a round foot, a thin stem and a cup. Axis z, the foot below; a revolution.
 
-A part of the Siléane data set out of bounding primitives (Fig. 6): three cylinders. Its sizes are not published; the
-values are ours.
+A part of the Siléane data set out of bounding primitives (Fig. 6): three cylinders. Its sizes are not
+published; the values are ours.
 """
 
 from pnet.geometry.symmetry import RevolutionSymmetry

@@ -110,11 +110,11 @@ def _symmetry_check(part: ParametricPart, mesh: trimesh.Trimesh) -> Check:
         angle = 2 * np.pi / part.sections
         turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
         elements = np.concatenate([elements, turn[None]])
-    solid = manifold(mesh)
-    worst = 0.0
+    name, solid, worst = "symmetry carries the solid onto itself", manifold(mesh), 0.0
+    if solid.volume() <= 0:
+        return Check(name, False, "the mesh is open")
     for element in elements[1:]:
         moved = solid.transform(np.c_[element, np.zeros(3)])
         worst = max(worst, 1 - (solid ^ moved).volume() / solid.volume())
     # where polygons stand for circles a turn by another angle leaves a little over
-    return Check("symmetry carries the solid onto itself", worst < 0.02, f"{100 * worst:.2g}% of the volume left over")
-
+    return Check(name, worst < 0.02, f"{100 * worst:.2g}% of the volume left over")

@@ -100,8 +100,11 @@ class NearestToPoint:
         return torch.where(length > TIE, direction / length.clamp(min=TIE), towards.expand_as(direction))
 
     def on_sphere(self, centre: Tensor) -> Tensor:
-        """Towards the point."""
-        return torch.nn.functional.normalize(self.points - centre, dim=-1)
+        """Towards the point; z where it is the centre."""
+        direction = self.points - centre
+        length = torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
+        upwards = torch.tensor([0.0, 0.0, 1.0]).to(direction).expand_as(direction)
+        return torch.where(length > TIE, direction / length.clamp(min=TIE), upwards)
 
 
 def first_by(keys: list[Tensor], allowed: Tensor) -> tuple[Tensor, Tensor]:

@@ -47,7 +47,9 @@ def _split(points: Points, normal: Points, offset: float, smallest: float) -> tu
     if (height >= -tolerance).all():
         return points, points[:0]
     simplices = ConvexHull(points).simplices
-    edges = np.unique(np.sort(np.concatenate([simplices[:, [0, 1]], simplices[:, [1, 2]], simplices[:, [0, 2]]])), axis=0)
+    edges = np.unique(
+        np.sort(np.concatenate([simplices[:, [0, 1]], simplices[:, [1, 2]], simplices[:, [0, 2]]])), axis=0
+    )
     a, b = edges[(height[edges[:, 0]] > 0) != (height[edges[:, 1]] > 0)].T
     share = (height[a] / (height[a] - height[b]))[:, None]
     crossing = points[a] + share * (points[b] - points[a])

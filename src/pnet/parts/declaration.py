@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -27,7 +28,8 @@ def check_names(keypoints: Sequence[Keypoint], parameters: Sequence[str]) -> Non
     for parameter in parameters:
         if not any(keypoint.parameter == parameter for keypoint in keypoints):
             raise ValueError(
-                f"no keypoint determines the parameter {parameter!r}; let one measure it, or drop the parameter"
+                f"no keypoint determines the parameter {parameter!r}; "
+                "let one measure it, or drop the parameter"
             )
 
 
@@ -57,11 +59,16 @@ def _check_measure(keypoint: Keypoint, parameters: Sequence[str]) -> None:
     if keypoint.parameter is not None:
         if keypoint.parameter not in parameters:
             raise ValueError(
-                f"{where} measures {keypoint.parameter!r}, which is not one of the parameters {list(parameters)}"
+                f"{where} measures {keypoint.parameter!r}, "
+                f"which is not one of the parameters {list(parameters)}"
             )
         if isinstance(keypoint.primitive, Corner):
             raise ValueError(f"{where} is a corner, whose place is given: it cannot measure a parameter")
-        if keypoint.factor <= 0:
+        if isinstance(keypoint.primitive, Plane) and keypoint.primitive.at is not None:
+            raise ValueError(
+                f"{where} measures {keypoint.parameter!r}, so its plane needs no at: leave one of them out"
+            )
+        if not 0 < keypoint.factor < math.inf:
             raise ValueError(f"{where}: factor is {keypoint.factor}, expected a positive number")
         return
     match keypoint.primitive:
@@ -93,7 +100,8 @@ def _check_reference(chain: KeypointChain, keypoint: Keypoint) -> None:
             or keypoint.parameter is None
         ):
             raise ValueError(
-                f"keypoint {keypoint.name!r} hangs on {other.name!r}, which is free on a circle or sphere; only a "
+                f"keypoint {keypoint.name!r} hangs on {other.name!r}, which is free on a circle or sphere; "
+                "only a "
                 "distance along the circle's axis can start there: take another reference"
             )
 
@@ -117,11 +125,14 @@ def _check_revolution(chain: KeypointChain, steps: Tensor) -> None:
         tilt = torch.linalg.vector_norm(axial[:2]) / torch.linalg.vector_norm(axial)
         if primitive.freedom is Freedom.SPHERE or float(tilt) > 1e-6:
             raise ValueError(
-                f"keypoint {keypoint.name!r}: the part is a revolution about z, so its equivalents are a circle about "
+                f"keypoint {keypoint.name!r}: the part is a revolution about z, "
+                "so its equivalents are a circle about "
                 "z or a point on z; use Cylinder or Circle around z, or a Plane along z"
             )
     if not any(chain.is_finite):
-        raise ValueError("no keypoint lies on the axis: the keypoints don't determine the axis' sense; add an end face")
+        raise ValueError(
+            "no keypoint lies on the axis: the keypoints don't determine the axis' sense; add an end face"
+        )
 
 
 def _check_finite(chain: KeypointChain, template: Tensor) -> None:
@@ -130,16 +141,14 @@ def _check_finite(chain: KeypointChain, template: Tensor) -> None:
     rank = int((size > 1e-6 * template.abs().max()).sum())
     if rank < 2:
         raise ValueError(
-            "the keypoints don't determine the pose: centroid and the keypoints that are not free on a circle lie on "
-            "one line; add one beside it"
+            "the keypoints don't determine the pose: centroid and the keypoints that are not free on a "
+            "circle lie on one line; add one beside it"
         )
     improper = chain.group[torch.linalg.det(chain.group) < 0]
     if rank == 2 and len(improper):
         fixed = (finite @ improper.mT - finite).abs().amax((-1, -2)) < 1e-6 * finite.abs().max()
         if not bool(fixed.any()):
             raise ValueError(
-                "the keypoints lie in one plane with the centroid, so a part and its mirror image look the same in "
-                "them; add one off that plane, or leave out the mirror"
+                "the keypoints lie in one plane with the centroid, so a part and its mirror image look the "
+                "same in them; add one off that plane, or leave out the mirror"
             )
-
-

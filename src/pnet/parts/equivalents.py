@@ -1,4 +1,5 @@
-"""The equivalent keypoints R(kp) of Fig. 4: a primitive's own freedom, carried through the part's symmetry."""
+"""The equivalent keypoints R(kp) of Fig. 4: a primitive's own freedom, carried through the part's
+symmetry."""
 
 import torch
 from torch import Tensor
@@ -7,7 +8,8 @@ from pnet.parts.primitives import Freedom, Primitive
 
 
 def along_and_radial(primitive: Primitive, step: Tensor) -> tuple[Tensor, Tensor]:
-    """A step's fixed and its free share: along the axis of a TURN and off it; all of a NONE; none of a SPHERE."""
+    """A step's fixed and its free share: along the axis of a TURN and off it; all of a NONE; none of a
+    SPHERE."""
     match primitive.freedom:
         case Freedom.NONE:
             return step, torch.zeros_like(step)

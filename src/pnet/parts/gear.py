@@ -1,7 +1,7 @@
 """Gear: a toothed wheel with a hub, as the data set annotates it: a revolution. Axis z, the wheel below.
 
-A part of the Siléane data set out of bounding primitives (Fig. 6): two cylinders; the teeth are inside the wheel's.
-Diameter and height are about those of the data set's object (114 and 61 mm); the hub's are ours.
+A part of the Siléane data set out of bounding primitives (Fig. 6): two cylinders; the teeth are inside the
+wheel's. Diameter and height are about those of the data set's object (114 and 61 mm); the hub's are ours.
 """
 
 from pnet.geometry.symmetry import RevolutionSymmetry
@@ -30,7 +30,9 @@ class Gear(ParametricPart):
         """The hub must be narrower than the wheel."""
         r, b, _ = parameters
         if b >= r:
-            raise ValueError(f"gear: the hub (b = {1000 * b:g} mm) must be narrower than the wheel (r = {1000 * r:g} mm)")
+            raise ValueError(
+                f"gear: the hub (b = {1000 * b:g} mm) must be narrower than the wheel (r = {1000 * r:g} mm)"
+            )
 
     def solid(self, parameters: Points) -> Solid:
         """Wheel and hub, the base at z = 0."""

@@ -89,7 +89,8 @@ class KeypointChain:
     Args:
         keypoints: the declaration. parameters: the part's parameter names.
         symmetry, mirror: the part's; see `full_group`.
-        centroid: parameters (n, k) → (n, 3) the centroid in the frame of construction, metres; None: its origin.
+        centroid: parameters (n, k) → (n, 3) the centroid in the frame of construction, metres; None: its
+            origin.
         typical: (k,) parameters of some part object, metres; tells which symmetry elements move a keypoint.
 
     Attributes:
@@ -181,7 +182,9 @@ class KeypointChain:
                 return self.choose(NearestToCamera(choice.frame.to(R) @ R), template)
             case KeypointRule.CANONICAL:
                 return template, torch.full_like(template[..., 0], torch.inf)
-        raise ValueError("the rule 'point' needs surface points: use choose(NearestToPoint(points), template)")
+        raise ValueError(
+            "the rule 'point' needs surface points: use choose(NearestToPoint(points), template)"
+        )
 
     def choose(self, judge: Judge, template: Tensor) -> tuple[Tensor, Tensor]:
         """Of all equivalents those that a rule prefers, keypoint by keypoint along the chain.
@@ -230,7 +233,8 @@ class KeypointChain:
         return torch.stack(columns, -1)
 
     def steps(self, keypoints: Tensor, centroid: Tensor | None = None) -> Tensor:
-        """From each keypoint's reference to it: (..., m, 3). centroid: (..., 3), None where it is the origin."""
+        """From each keypoint's reference to it: (..., m, 3). centroid: (..., 3), None where it is the
+        origin."""
         origin = torch.zeros_like(keypoints[..., :1, :]) if centroid is None else centroid[..., None, :]
         return keypoints - torch.cat([origin, keypoints], -2)[..., self.reference, :]
 
@@ -259,7 +263,9 @@ class KeypointChain:
             (..., m, 3).
         """
         places = [torch.zeros_like(keypoints[..., 0, :])]
-        for i, (keypoint, step) in enumerate(zip(self.keypoints, self.steps(keypoints).unbind(-2), strict=True)):
+        for i, (keypoint, step) in enumerate(
+            zip(self.keypoints, self.steps(keypoints).unbind(-2), strict=True)
+        ):
             along, radial = along_and_radial(keypoint.primitive, step)
             if keypoint.primitive.freedom is not Freedom.NONE:
                 template = along_and_radial(keypoint.primitive, keypoint.primitive.direction.to(step))[1]
@@ -273,7 +279,9 @@ class KeypointChain:
         template, observed = torch.broadcast_tensors(template, observed)
         places = [torch.zeros_like(template[..., 0, :])]
         seen = self.steps(observed).unbind(-2)
-        for i, (keypoint, step) in enumerate(zip(self.keypoints, self.steps(template).unbind(-2), strict=True)):
+        for i, (keypoint, step) in enumerate(
+            zip(self.keypoints, self.steps(template).unbind(-2), strict=True)
+        ):
             if keypoint.primitive.freedom is not Freedom.NONE:
                 along, radial = along_and_radial(keypoint.primitive, step)
                 towards = along_and_radial(keypoint.primitive, seen[i])[1]
@@ -310,7 +318,8 @@ class KeypointChain:
         return finite[1:]
 
     def _find_chiralities(self, template: Tensor, mirror: Tensor | None) -> list[Tensor]:
-        """The mirror makes a second structure unless some reflection leaves every finite keypoint in place."""
+        """The mirror makes a second structure unless some reflection leaves every finite keypoint in
+        place."""
         eye = torch.eye(3, dtype=torch.float64)
         if mirror is None:
             return [eye]

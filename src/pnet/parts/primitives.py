@@ -105,7 +105,8 @@ class Cylinder:
     """Kp-in-cylinder: the reference lies on the axis, every point at its height is a foot.
 
     Attributes:
-        around: the axis. towards: the template's own foot, perpendicular to the axis; None: the next of x, y, z.
+        around: the axis. towards: the template's own foot, perpendicular to the axis; None: the next of x, y,
+            z.
     """
 
     around: Direction = "z"
@@ -129,7 +130,8 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Circle(Cylinder):
-    """In-Prim: the reference is a circle's centre, in its plane (the rim of an end face, of a cone's base)."""
+    """In-Prim: the reference is a circle's centre, in its plane (the rim of an end face, of a cone's
+    base)."""
 
 
 @dataclass(frozen=True)

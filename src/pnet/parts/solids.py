@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from itertools import pairwise
 
 import manifold3d
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from pnet.parts.clipping import convex_difference
 
 Points = NDArray[np.float64]
+Extent = tuple[Points | float, Points | float]
 # where a shape's own z goes: columns are the images of its x, y and z
 _FRAMES = {
     "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
@@ -56,6 +58,10 @@ class Shape(ABC):
         volume, moment = self.own_volume_and_moment(sections)
         place = np.stack(np.broadcast_arrays(*map(np.asarray, self.at)), -1)
         return volume, moment @ _FRAMES[self.axis].T + volume[..., None] * place
+
+    def is_valid(self, sections: int) -> NDArray[np.bool_]:
+        """(...) whether the sizes make a body with an inside."""
+        return self.own_volume_and_moment(sections)[0] > 0
 
     def mesh(self, sections: int) -> trimesh.Trimesh:
         """Watertight mesh of one size where it is placed."""
@@ -138,6 +144,10 @@ class Revolution(Shape):
         weighted = z * (3 * r * r + 2 * r * s + s * s) + w * (r * r + 2 * r * s + 3 * s * s)
         upright = kappa * (rise * weighted / 12).sum(-1)
         return volume, np.stack([np.zeros_like(volume), np.zeros_like(volume), upright], -1)
+
+    def is_valid(self, sections: int) -> NDArray[np.bool_]:
+        """Radii must not be negative: their squares would hide it."""
+        return super().is_valid(sections) & (self.profile[..., 0] >= 0).all(-1)
 
     def own_mesh(self, sections: int) -> trimesh.Trimesh:
         """The lathe's mesh."""
@@ -282,8 +292,8 @@ def prism(outline: Points, low: Points | float, high: Points | float) -> Extrusi
     return Extrusion(outline, low, high)
 
 
-def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> Extrusion:
-    """A cuboid by its extents, metres."""
+def box(x: Extent, y: Extent, z: Extent) -> Extrusion:
+    """A cuboid by its extents (from, to), metres."""
     corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
     outline = np.stack([np.stack(np.broadcast_arrays(*corner), -1) for corner in corners], -2)
     return Extrusion(outline.astype(float), *z)
@@ -349,7 +359,7 @@ def _slabs(profile: Points) -> list[tuple[float, float, tuple[float, float], tup
     edges = [(a, b) for a, b in zip(profile, np.roll(profile, -1, 0), strict=True) if a[1] != b[1]]
     heights = np.unique(profile[:, 1])
     slabs = []
-    for low, high in zip(heights[:-1], heights[1:], strict=True):
+    for low, high in pairwise(heights.tolist()):
         across = []
         for a, b in edges:
             bottom, top = sorted((a[1], b[1]))

@@ -1,7 +1,7 @@
 """T-Less 20: an electrical fitting, cuboid below and cylinder above. z up; symmetry: half turns about z.
 
-A part of the Siléane data set out of bounding primitives (Fig. 6): a cuboid and a cylinder. The overall size is about
-the data set's (83 × 75.5 × 47 mm); the share of the cylinder is ours.
+A part of the Siléane data set out of bounding primitives (Fig. 6): a cuboid and a cylinder. The overall size
+is about the data set's (83 × 75.5 × 47 mm); the share of the cylinder is ours.
 """
 
 import numpy as np
@@ -14,7 +14,8 @@ from pnet.parts.solids import Solid, box, cylinder
 
 
 class TLess20(ParametricPart):
-    """Length l along x, width w along y and height b of the cuboid, radius r of the cylinder, total height h."""
+    """Length l along x, width w along y and height b of the cuboid, radius r of the cylinder, total height
+    h."""
 
     name = "tless20"
     parameter_names = ("l", "w", "b", "r", "h")
@@ -41,4 +42,4 @@ class TLess20(ParametricPart):
     def solid(self, parameters: Points) -> Solid:
         """The cylinder on the cuboid, the base at z = 0."""
         length, w, b, r, h = self.split(parameters)
-        return box((-length / 2, length / 2), (-w / 2, w / 2), (0 * h, b)) | cylinder(r, b, h)
+        return box((-length / 2, length / 2), (-w / 2, w / 2), (0, b)) | cylinder(r, b, h)

@@ -1,6 +1,8 @@
-"""T-Less 29: an electrical fitting, a wide cuboid with a narrower one above. z up; symmetry: half turns about z.
+"""T-Less 29: an electrical fitting, a wide cuboid with a narrower one above. z up; symmetry: half turns about
+z.
 
-A part of the Siléane data set out of bounding primitives: two cuboids. Its sizes are not known to us; the values are ours.
+A part of the Siléane data set out of bounding primitives: two cuboids. Its sizes are not known to us; the
+values are ours.
 """
 
 import numpy as np
@@ -13,8 +15,8 @@ from pnet.parts.solids import Solid, box
 
 
 class TLess29(ParametricPart):
-    """Length l along x and width w along y of both cuboids' outline, height b of the lower one, total height h,
-    length s of the upper one."""
+    """Length l along x and width w along y of both cuboids' outline, height b of the lower one, total height
+    h, length s of the upper one."""
 
     name = "tless29"
     parameter_names = ("l", "w", "b", "s", "h")
@@ -34,12 +36,12 @@ class TLess29(ParametricPart):
         length, _, b, s, h = parameters
         if s > length + 1e-9 or b >= h:
             raise ValueError(
-                f"tless29: the upper cuboid must be no longer than the lower one (s <= l) and stand above it (h > b), "
-                f"got {self.text(np.asarray(parameters))}"
+                "tless29: the upper cuboid must be no longer than the lower one (s <= l) and stand above it "
+                f"(h > b), got {self.text(np.asarray(parameters))}"
             )
 
     def solid(self, parameters: Points) -> Solid:
         """The upper cuboid on the lower, the base at z = 0."""
         length, w, b, s, h = self.split(parameters)
         y = (-w / 2, w / 2)
-        return box((-length / 2, length / 2), y, (0 * h, b)) | box((-s / 2, s / 2), y, (b, h))
+        return box((-length / 2, length / 2), y, (0, b)) | box((-s / 2, s / 2), y, (b, h))

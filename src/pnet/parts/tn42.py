@@ -39,6 +39,7 @@ class TN42(ParametricPart):
     def solid(self, parameters: Points) -> Shape:
         """The trapezoid in the zx plane, extruded along y."""
         length, a, w = self.split(parameters)
-        corners = [(0, 0), (a, 0), (SMALL_END, length), (0, length)]  # z, x
-        outline = np.stack([np.stack(np.broadcast_arrays(*zx, 0.0 * a), -1)[..., :2] for zx in corners], -2)
+        zero = 0 * a
+        corners = [(zero, zero), (a, zero), (zero + SMALL_END, length), (zero, length)]  # z, x
+        outline = np.stack([np.stack(corner, -1) for corner in corners], -2)
         return moved(prism(outline, -w / 2, w / 2), axis="y")

@@ -14,8 +14,8 @@ def fit_error(part: ParametricPart, rule: KeypointRule, samples: int, seed: int 
     """Largest errors of poses fitted to exact label keypoints of random instances.
 
     Args:
-        part: the template. rule: which equivalent is the label; under `point` the nearest to a random direction's
-            surface point. samples: random (parameters, pose) pairs. seed: of them.
+        part: the template. rule: which equivalent is the label; under `point` the nearest to a random
+            direction's surface point. samples: random (parameters, pose) pairs. seed: of them.
     Returns:
         rotation error modulo the part's symmetry, radians (the largest difference of a matrix entry, which is
         accurate for small angles), and position error, metres.

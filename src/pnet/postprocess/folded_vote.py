@@ -1,12 +1,14 @@
 """Voting modulo the part's symmetry: votes for different equivalents of a keypoint agree.
 
-Under the rule `point` an instance's points are taught different equivalents on purpose; under `camera` they disagree
-where two are nearly equally near. A mean over equivalents is none of them. Here every point's keypoints make a
-hypothesis of the pose; the hypotheses are averaged modulo the symmetry group, and each point's keypoints are then
-carried by a symmetry element to the template's own place, where votes differ by their errors only.
+Under the rule `point` an instance's points are taught different equivalents on purpose; under `camera` they
+disagree where two are nearly equally near. A mean over equivalents is none of them. Here every point's
+keypoints make a hypothesis of the pose; the hypotheses are averaged modulo the symmetry group, and each
+point's keypoints are then carried by a symmetry element to the template's own place, where votes differ by
+their errors only.
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -23,7 +25,7 @@ FLOOR = 1e-6  # metres: votes nearer to each other than this are equal
 
 @dataclass(frozen=True)
 class FoldedVote:
-    """Robust voting modulo the symmetry.
+    """Robust voting modulo the symmetry; the radius filter serves the centroids.
 
     Attributes:
         hypotheses: the most points of a cluster whose poses are averaged; the first, so well spread ones.
@@ -31,6 +33,8 @@ class FoldedVote:
         width: angle from the mean at which a hypothesis no longer counts, degrees.
         cut: distance from the location at which a vote no longer counts, in medians of that distance.
     """
+
+    filters_keypoints: ClassVar[bool] = False
 
     hypotheses: int
     votes: int
@@ -121,8 +125,8 @@ def members(owner: Tensor, d: int, most: int) -> tuple[Tensor, Tensor]:
     Args:
         owner: (N,) cluster in [0, d), −1 for none; every cluster has a point. most: of a cluster.
     Returns:
-        index (d, n) into the points, n at most `most`; valid (d, n) bool: False where a cluster is smaller (index
-        then repeats its first point).
+        index (d, n) into the points, n at most `most`; valid (d, n) bool: False where a cluster is smaller
+        (index then repeats its first point).
     """
     order = torch.argsort(owner, stable=True)[int((owner < 0).sum()) :]
     size = torch.bincount(owner[order], minlength=d)
@@ -142,5 +146,7 @@ def _median(values: Tensor, valid: Tensor) -> Tensor:
 def _misfit(chain: KeypointChain, sizes: Tensor, R: Tensor, t: Tensor, keypoints: Tensor) -> Tensor:
     """(n,) root mean square distance of votes from the template at their own pose, metres."""
     local = apply_inverse_pose(R, t, keypoints)
-    errors = [chain.place_like(sizes, local @ M.to(local)) @ M.to(local).mT - local for M in chain.chiralities]
+    errors = [
+        chain.place_like(sizes, local @ M.to(local)) @ M.to(local).mT - local for M in chain.chiralities
+    ]
     return torch.stack([error.square().sum(-1).mean(-1).sqrt() for error in errors]).amin(0)

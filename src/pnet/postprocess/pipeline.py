@@ -47,6 +47,8 @@ class PoseRecovery:
         centroids = prediction.centroid[scene].cpu().double()
         keypoints = prediction.keypoints[scene].cpu().double()
         labels = self.cluster(centroids)
+        if not bool(torch.isfinite(keypoints).all()):  # a network that has diverged finds nothing
+            labels = torch.full_like(labels, -1)
         d = int(labels.max()) + 1 if len(labels) else 0
         if d == 0:
             return no_detections(part, len(labels))
@@ -64,8 +66,10 @@ class PoseRecovery:
         return best_first(found, visibility >= threshold)
 
     def _reliable(self, centroids: Tensor, keypoints: Tensor, labels: Tensor) -> Tensor:
-        """(N, 1 + m) which votes count: those in a cluster that the radius filter keeps."""
-        places = torch.cat([centroids[:, None], keypoints], 1)
+        """(N, 1 + m) or (N, 1) which votes count: those in a cluster that the radius filter keeps."""
+        places = centroids[:, None]
+        if self.voting.filters_keypoints:
+            places = torch.cat([places, keypoints], 1)
         if self.radius_filter is None:
             return (labels >= 0)[:, None].expand(-1, places.shape[1])
         return torch.stack([self.radius_filter(votes, labels) for votes in places.unbind(1)], 1)

@@ -1,7 +1,7 @@
 """Hough voting: each cluster's reliable votes are averaged."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -16,7 +16,8 @@ class PointVotes:
     Attributes:
         centroid: (N, 3), keypoints: (N, m, 3) camera frame, metres.
         owner: (N,) cluster in [0, d), −1 for none. d: number of clusters.
-        reliable: (N, 1 + m) bool: which votes for the centroid and each keypoint count; at least one a cluster.
+        reliable: (N, 1 + m) bool: which votes for the centroid and each keypoint count, at least one a
+            cluster; (N, 1) for a voting that weighs keypoints in its own way.
     """
 
     centroid: Tensor
@@ -42,7 +43,13 @@ class InstanceVotes:
 
 
 class Voting(Protocol):
-    """Brings the votes of every cluster together."""
+    """Brings the votes of every cluster together.
+
+    Attributes:
+        filters_keypoints: whether the radius filter's verdict on keypoint votes is used.
+    """
+
+    filters_keypoints: ClassVar[bool]
 
     def __call__(self, part: ParametricPart, votes: PointVotes) -> InstanceVotes:
         """One set of keypoints and parameters for every cluster."""
@@ -51,7 +58,10 @@ class Voting(Protocol):
 
 @dataclass(frozen=True)
 class MeanVote:
-    """The paper's: plain means; the votes of an instance must mean the same one of the equivalent keypoints."""
+    """The paper's: plain means; the votes of an instance must mean the same one of the equivalent
+    keypoints."""
+
+    filters_keypoints: ClassVar[bool] = True
 
     def __call__(self, part: ParametricPart, votes: PointVotes) -> InstanceVotes:
         """Means of centroids, keypoints and, point by point (module M_P), parameters."""

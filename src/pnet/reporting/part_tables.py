@@ -94,7 +94,11 @@ def equivalents_text(part: ParametricPart, keypoint: int) -> str:
 def _measure_text(keypoint: Keypoint) -> str:
     if keypoint.parameter is None:
         return "nothing, a reference"
-    return keypoint.parameter if keypoint.factor == 1 else f"{keypoint.parameter} (distance {keypoint.factor:g} of it)"
+    return (
+        keypoint.parameter
+        if keypoint.factor == 1
+        else f"{keypoint.parameter} (distance {keypoint.factor:g} of it)"
+    )
 
 
 def _table(title: str, *columns: str) -> Table:
