@@ -1,4 +1,4 @@
-"""A scene small enough to count: three flanges side by side, points on their faces."""
+"""Parts to draw, and a scene small enough to count: three flanges side by side, points on their faces."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,12 +8,57 @@ import pytest
 import torch
 
 from pnet.geometry.camera import Camera
+from pnet.geometry.symmetry import RevolutionSymmetry, SphericalSymmetry
 from pnet.parts.base import ParametricPart
+from pnet.parts.keypoints import Keypoint
+from pnet.parts.primitives import Plane, Sphere
+from pnet.parts.solids import Ball, cylinder
 from pnet.parts.tn34 import TN34
+from pnet.parts.tn42 import TN42
 from pnet.records import Detections, Scene, SceneId
 
 R, H = 0.018, 0.016
 POINTS_PER_BODY = 200
+
+
+class Marble(ParametricPart):
+    """One keypoint, one parameter, every rotation a symmetry."""
+
+    name = "marble"
+    parameter_names = ("r",)
+    symmetry = SphericalSymmetry()
+    keypoints = (Keypoint("surface", "centroid", Sphere(), "r"),)
+
+    def solid(self, parameters):
+        return Ball(self.split(parameters)[0])
+
+
+class Disc(ParametricPart):
+    """One keypoint on the axis."""
+
+    name = "disc"
+    parameter_names = ("h",)
+    symmetry = RevolutionSymmetry(rotoreflection=True)
+    keypoints = (Keypoint("face", "centroid", Plane("z"), "h", factor=0.5),)
+
+    def solid(self, parameters):
+        (h,) = self.split(parameters)
+        return cylinder(0.01 + 0 * h, -h / 2, h / 2)
+
+
+@pytest.fixture(scope="session")
+def marble() -> ParametricPart:
+    return Marble({"r": [10]})
+
+
+@pytest.fixture(scope="session")
+def disc() -> ParametricPart:
+    return Disc({"h": [12]})
+
+
+@pytest.fixture(scope="session")
+def bar() -> ParametricPart:
+    return TN42(learning={"l": [40], "a": [16], "w": [12]})
 
 
 @pytest.fixture(scope="session")

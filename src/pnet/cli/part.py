@@ -1,5 +1,6 @@
 """pnet-part: show, check and draw a part."""
 
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from pnet.parts.base import ParametricPart
     from pnet.parts.checks import Check
 
+FORMATS = ("stl", "obj", "glb", "ply")
+
 
 def main() -> None:
     """Entry point; `part=all` is no file of conf/part, so it becomes a setting of its own."""
@@ -30,7 +33,8 @@ def show_parts(cfg: DictConfig) -> None:
 
     from pnet.reporting.part_picture import gallery
 
-    out, folder = Console(soft_wrap=True), Path(cfg.output)
+    _check_settings(cfg)
+    out, folder = Console(soft_wrap=True), Path(str(cfg.output))
     parts = [_named(name, node) for name, node in _chosen(cfg)]
     failed = [part.name for part in parts if not show_part(out, part, cfg, folder / part.name)]
     if cfg.all:
@@ -47,12 +51,12 @@ def show_part(out: "Console", part: "ParametricPart", cfg: DictConfig, folder: P
     from pnet.reporting.part_tables import check_table, constants_table, keypoint_table, parameter_table
 
     parameters = _parameters(part, cfg)
-    folder.mkdir(parents=True, exist_ok=True)
     checks = list(part_checks(part, cfg.samples))
     for table in (parameter_table(part, parameters), keypoint_table(part), constants_table(part, parameters)):
         out.print(table)
     out.print(check_table(checks))
     mesh = part.mesh(parameters)
+    folder.mkdir(parents=True, exist_ok=True)
     for ending in cfg.formats:
         write_mesh(mesh, folder / f"{part.name}.{ending}")
     write_poseutils(folder / "poseutils.json", part.pose_space(parameters))
@@ -67,8 +71,6 @@ def part_checks(part: "ParametricPart", samples: int) -> Iterator["Check"]:
     from pnet.parts.choice import KeypointRule
     from pnet.postprocess.fit_check import fit_error
 
-    if samples < 1:
-        raise ValueError(f"samples is {samples}, expected at least 1")
     yield from check_part(part, samples)
     for rule in KeypointRule:
         angle, distance = fit_error(part, rule, samples)
@@ -82,13 +84,19 @@ def write_mesh(mesh: Any, path: Path) -> None:
     """Export in the format that the ending names; the file appears when it is whole."""
     from pnet.scenes.store import write_atomically
 
-    try:
-        content = mesh.export(file_type=path.suffix.removeprefix("."))
-    except (ValueError, KeyError) as fault:
-        raise ValueError(
-            f"formats: cannot write {path.name} ({fault}); choose among stl, obj, glb, ply"
-        ) from fault
+    content = mesh.export(file_type=path.suffix.removeprefix("."))
     write_atomically(path, content.encode() if isinstance(content, str) else content)
+
+
+def _check_settings(cfg: DictConfig) -> None:
+    """Refuse what no part can be shown with, before anything is written."""
+    if cfg.output is None:
+        raise ValueError("output is null, expected a folder")
+    for key, least in (("samples", 1), ("index", 0)):
+        if type(cfg[key]) is not int or cfg[key] < least:
+            raise ValueError(f"{key} is {cfg[key]}, expected a whole number of at least {least}")
+    if not OmegaConf.is_list(cfg.formats) or not set(cfg.formats) <= set(FORMATS):
+        raise ValueError(f"formats is {cfg.formats}, expected a list out of {', '.join(FORMATS)}")
 
 
 def _chosen(cfg: DictConfig) -> Iterator[tuple[str, DictConfig]]:
@@ -98,16 +106,21 @@ def _chosen(cfg: DictConfig) -> Iterator[tuple[str, DictConfig]]:
     for path in sorted((config_dir() / "part").glob("*.yaml")):
         node = OmegaConf.load(path)
         assert isinstance(node, DictConfig)
-        yield str(path), node
+        yield path.stem, node
 
 
 def _named(name: str, node: DictConfig) -> "ParametricPart":
     from pnet.cli.instantiate import instantiate
+    from pnet.parts.base import ParametricPart
 
     try:
-        part: ParametricPart = instantiate(node)
+        part = instantiate(node)
     except ValueError as fault:
-        raise ValueError(f"{name}: {fault}") from fault
+        raise ValueError(f"{name}.{str(fault).removeprefix('config.')}") from fault
+    if not isinstance(part, ParametricPart):
+        raise ValueError(f"{name}._target_: {node.get('_target_')} is no ParametricPart")
+    if not isinstance(part.name, str) or not re.fullmatch(r"\w[\w.-]*", part.name):
+        raise ValueError(f"{name}.name is {part.name!r}: files are named by it, so give one plain word")
     return part
 
 
@@ -115,11 +128,14 @@ def _parameters(part: "ParametricPart", cfg: DictConfig) -> "NDArray[np.float64]
     """(k,) metres: the settings' own values, or a part object of a grid."""
     import numpy as np
 
-    if cfg.values is None or cfg.all:
+    values = cfg["values"]  # not cfg.values, which is a method
+    if values is None or cfg.all:
         return part.part_object(cfg.grid, 0 if cfg.all else cfg.index)
-    values = OmegaConf.to_container(cfg.values)
-    if not isinstance(values, dict) or set(values) != set(part.parameter_names):
-        raise ValueError(f"values names {values}, {part.name} has {', '.join(part.parameter_names)}")
-    parameters = np.array([float(values[name]) for name in part.parameter_names]) / 1000
+    if not OmegaConf.is_dict(values) or set(values) != set(part.parameter_names):
+        raise ValueError(f"values is {values}, expected numbers for {', '.join(part.parameter_names)}")
+    try:
+        parameters = np.array([float(values[name]) for name in part.parameter_names]) / 1000
+    except (TypeError, ValueError) as fault:
+        raise ValueError(f"values is {values}, expected numbers in mm") from fault
     part.check_named(parameters)
     return parameters

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property, lru_cache
 from itertools import product
+from numbers import Real
 
 import numpy as np
 import torch
@@ -61,7 +62,7 @@ class ParametricPart(ABC):
         """
         if len(set(self.parameter_names)) < len(self.parameter_names):
             raise ValueError(f"{self.name}: a parameter name comes twice in {list(self.parameter_names)}")
-        if sections < 6 or sections % 6:
+        if not isinstance(sections, int) or sections < 6 or sections % 6:
             raise ValueError(f"{self.name}: sections is {sections}, expected a multiple of 6")
         self.sections = sections
         self.grids = {"L": self._grid("learning", learning)}
@@ -224,12 +225,12 @@ class ParametricPart(ABC):
                 )
 
     def _grid(self, key: str, values: Grid) -> Points:
-        if set(values) != set(self.parameter_names):
-            raise ValueError(
-                f"part.{key} names {sorted(values)}, {self.name} has {sorted(self.parameter_names)}"
-            )
+        if not isinstance(values, Mapping) or set(values) != set(self.parameter_names):
+            names = sorted(values) if isinstance(values, Mapping) else values
+            raise ValueError(f"part.{key} names {names}, {self.name} has {sorted(self.parameter_names)}")
         for name, column in values.items():
-            if isinstance(column, (str, int, float)) or not len(column):
+            numbers = isinstance(column, Sequence | np.ndarray) and all(isinstance(x, Real) for x in column)
+            if not numbers or not len(column):
                 raise ValueError(f"part.{key}.{name} is {column!r}, expected a list of values in mm")
         axes = [values[name] for name in reversed(self.parameter_names)]
         return np.array([combination[::-1] for combination in product(*axes)], float) / 1000

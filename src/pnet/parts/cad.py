@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from scipy.spatial import ConvexHull
 
 from pnet.geometry.symmetry import RevolutionSymmetry, SphericalSymmetry, Symmetry
 from pnet.parts.base import ParametricPart
-from pnet.parts.declared import Fields, keypoint_from, mirror_from, symmetry_from
+from pnet.parts.declared import Fields, check_kind, keypoint_from, mirror_from, symmetry_from
 from pnet.parts.keypoints import Keypoint
 from pnet.parts.primitives import Circle, Corner, Plane, Sphere
 from pnet.parts.solids import Shape
@@ -58,16 +59,22 @@ class CadPart(ParametricPart):
         sections: int = 48,
     ) -> None:
         self.name = name
+        if not isinstance(mesh, str):
+            raise ValueError(f"{name}: mesh is {mesh!r}, expected a file's path; give it as part.mesh=")
         self.symmetry, self.mirror = symmetry_from(symmetry), mirror_from(mirror)
         self._body = CadShape(read_mesh(Path(mesh), unit), collision)
         if keypoints is None:
             chosen, found = bounding_keypoints(bounds, self._body.whole, self.symmetry)
         else:
+            check_kind(Mapping, "a mapping", keypoints=keypoints)
             chosen = tuple(keypoint_from(key, fields) for key, fields in keypoints.items())
             if sizes is None:
                 raise ValueError(
                     f"{name}: give sizes: with the value in mm of every parameter that keypoints measure"
                 )
+            check_kind(Mapping, "a mapping", sizes=sizes)
+            for key, value in sizes.items():
+                check_kind(Real, "a number in mm", **{f"sizes.{key}": value})
             found = {key: value / 1000 for key, value in sizes.items()}
         self.keypoints, self.parameter_names = chosen, tuple(found)
         super().__init__({key: [1000 * value] for key, value in found.items()}, None, sections)

@@ -74,12 +74,17 @@ class DeclaredPart(ParametricPart):
         require: Sequence[str] = (),
         sections: int = 48,
     ) -> None:
-        self.name, self.parameter_names = name, tuple(parameters)
+        self.name = name
         try:
+            check_kind(Sequence, "a list", parameters=parameters, solid=solid)
+            check_kind(Mapping, "a mapping", keypoints=keypoints)
+            self.parameter_names = tuple(parameters)
             if not solid:
                 raise ValueError("the solid has no step: begin with {add: cylinder, …}")
             self._steps = [_Step(i, fields) for i, fields in enumerate(solid)]
-            self._require = [require] if isinstance(require, str) else list(require)
+            conditions = [require] if isinstance(require, str) else require
+            check_kind(Sequence, "a list of comparisons", require=conditions)
+            self._require = [str(condition) for condition in conditions]
             for i, step in enumerate(self._steps):
                 for expression in step.expressions():
                     _named(f"solid[{i}]", check_expression, expression, self.parameter_names)
@@ -105,6 +110,13 @@ class DeclaredPart(ParametricPart):
             return length(expression, self.parameter_names, np.asarray(parameters, float))
 
         return Solid(tuple((step.operation, step.shape(value)) for step in self._steps))
+
+
+def check_kind(kind: type, words: str, **fields: Any) -> None:
+    """Raise ValueError that names the first field of another kind; a text counts as no list."""
+    for key, value in fields.items():
+        if isinstance(value, str) or not isinstance(value, kind):
+            raise ValueError(f"{key} is {value!r}, expected {words}")
 
 
 def _named(where: str, check: Callable[[Any, Sequence[str]], None], text: Any, names: Sequence[str]) -> None:
@@ -328,7 +340,7 @@ def symmetry_from(value: str | Fields) -> Symmetry:
 
 def mirror_from(normal: str | None) -> torch.Tensor | None:
     """The reflection in the plane with this normal."""
-    return None if normal is None else reflection(tuple(unit(normal).tolist()))
+    return None if normal is None else reflection(tuple(unit(_direction("mirror", normal)).tolist()))
 
 
 def _closest(word: str, known: Sequence[str] | Mapping[str, Any]) -> str:

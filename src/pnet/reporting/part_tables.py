@@ -46,7 +46,7 @@ def constants_table(part: ParametricPart, parameters: Points) -> Table:
     table.add_row("size", f"{extent} mm")
     table.add_row("volume", f"{1e9 * mesh.volume:.6g} mm³")
     table.add_row("surface", f"{1e6 * mesh.area:.6g} mm²")
-    centre = ", ".join(f"{1000 * x + 0.0:.4g}" for x in space.centre.tolist())
+    centre = ", ".join(f"{round(1000 * x, 4) + 0.0:g}" for x in space.centre.tolist())
     table.add_row("surface centroid from the volume's", f"{centre} mm")
     if isinstance(space.symmetry, FiniteSymmetry):
         scale = ", ".join(f"{1000 * x:.4f}" for x in space.scale.diagonal().tolist())
