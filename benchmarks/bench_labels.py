@@ -23,28 +23,23 @@ from pnet.postprocess.vote import MeanVote, PointVotes
 
 SCENES, INSTANCES, POINTS = 100, 60, 16384
 REPEATS = 7
+PARTS = ("tn06", "tn16", "tn34", "tn42", "tless20")
+COLUMNS = {"camera": 9, "amortised": 11, "plain loop": 12, "point": 8, "mean vote": 11, "folded": 10}
 FOLDED = FoldedVote(hypotheses=256, votes=512, width=25.0, cut=1.5)
 
 
 def main() -> None:
     """Print one table row for each part."""
     torch.set_num_threads(2)
+    print(f"{platform.processor() or platform.machine()}, 2 threads, medians of {REPEATS}")
     print(
-        f"{platform.processor() or platform.machine()}, 2 threads, medians of {REPEATS}, milliseconds a scene"
+        f"milliseconds a scene of {INSTANCES} instances, {POINTS} points; amortised: {SCENES} scenes a call"
     )
-    print(f"of {INSTANCES} instances and {POINTS} points; amortised: {SCENES} scenes in one call")
-    print(
-        f"{'part':8}{'camera':>9}{'amortised':>11}{'plain loop':>12}{'point':>8}{'mean vote':>11}{'folded':>8}"
-    )
-    for name in ("tn06", "tn16", "tn34", "tn42", "tless20"):
+    print(f"{'part':8}" + "".join(f"{title:>{width}}" for title, width in COLUMNS.items()))
+    for name in PARTS:
         part = instantiate(OmegaConf.load(config_dir() / "part" / f"{name}.yaml"))
-        print(
-            f"{name:8}"
-            + "".join(f"{value:{width}.3f}" for value, width in zip(times(part), WIDTHS, strict=True))
-        )
-
-
-WIDTHS = (9, 11, 12, 8, 11, 8)
+        row = zip(times(part), COLUMNS.values(), strict=True)
+        print(f"{name:8}" + "".join(f"{value:{width}.3f}" for value, width in row))
 
 
 def times(part: ParametricPart) -> list[float]:

@@ -3,6 +3,7 @@
 import math
 
 import pytest
+import roma
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -164,3 +165,13 @@ def test_instances_side_by_side_are_as_one_by_one(symmetry):
     assert together.shape == (6, 3, 3)
     assert angle_modulo(symmetry, together, alone) < 1e-9
     assert mean_rotation(R.view(2, 3, 15, 3, 3), weight.view(2, 3, 15), symmetry, WIDTH).shape == (2, 3, 3, 3)
+
+
+def test_a_small_cluster_does_not_depend_on_the_padding_beside_it():
+    R = roma.random_rotmat(20).double()
+    R = roma.special_procrustes(R)
+    R[6:] = R[0]
+    alone = mean_rotation(R, torch.ones(20).double(), cyclic(2), 0.4)
+    padded = torch.cat([R, R[:1].expand(200, 3, 3)])
+    weight = torch.cat([torch.ones(20), torch.zeros(200)]).double()
+    torch.testing.assert_close(mean_rotation(padded, weight, cyclic(2), 0.4), alone, atol=1e-9, rtol=0)

@@ -146,14 +146,15 @@ def test_by_hand(tn34):
     ],
 )
 def test_a_label_counts_by_its_margin_over_margin_and_scale(tn34, margin, trust):
-    """Scale 2 mm, errors 3, 4 and 12. `each` weighs distances, the others squares."""
+    """Scale 2 mm, errors 3, 4 and 12. `squared` weighs squares, the others distances."""
     batch = point(margin)
     predicted = moved(batch, [[3.0, 0, 0], [0, 4, 0], [0, 0, 12]])
     found = {n: float(ParametricLoss(tn34.chain, n, 0.002)(predicted, batch)["keypoints"]) for n in NORMS}
     squares = sum(w * e * e for w, e in zip(trust, (3, 4, 12), strict=True))
+    scaled = math.hypot(*(w * e for w, e in zip(trust, (3, 4, 12), strict=True)))
     distances = sum(w * e for w, e in zip(trust, (3, 4, 12), strict=True))
     assert found["squared"] == pytest.approx(squares, abs=1e-6)
-    assert found["distance"] == pytest.approx(math.sqrt(squares), abs=1e-6)
+    assert found["distance"] == pytest.approx(scaled, abs=1e-6)
     assert found["each"] == pytest.approx(distances, abs=1e-6)
 
 

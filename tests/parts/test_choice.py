@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from pnet.geometry.symmetry import rotation_about_z
+from pnet.geometry.symmetry import cyclic, rotation_about_z
 from pnet.parts.choice import KeypointChoice, KeypointRule, NearestToCamera, NearestToPoint, first_by
 from pnet.parts.equivalents import along_and_radial
-from pnet.parts.primitives import Freedom
+from pnet.parts.keypoints import Keypoint, KeypointChain
+from pnet.parts.primitives import Freedom, Plane
 
 TURNS = 2880
 DOWN = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))  # camera looks along part -z
@@ -42,6 +43,7 @@ def equivalents(keypoint, step: Tensor, group: Tensor) -> Tensor:
 def check_against_brute_force(chain, template: Tensor, found: Tensor, margin: Tensor, cost) -> None:
     """Every keypoint costs least of those that the choices before it leave, and its margin is the lead."""
     alive, places, margins = list(range(len(chain.group))), [torch.zeros(3).double()], [math.inf]
+    narrowed = math.inf
     for i, keypoint in enumerate(chain.keypoints):
         step = chain.steps(template)[i]
         start = places[chain.reference[i]]
@@ -53,7 +55,12 @@ def check_against_brute_force(chain, template: Tensor, found: Tensor, margin: Te
         gap = (sample - found[i]).norm(dim=-1).amin(-1)
         owners = [g for g in alive if gap[g] < (1e-9 if sample.shape[1] == 1 else 0.02 * step.norm())]
         assert owners and all(least[g] <= best + 50 * near for g in owners)
-        runner_up = min((c for g, c in least.items() if g not in owners), default=math.inf) - best
+        lead = min((c for g, c in least.items() if g not in owners), default=math.inf) - best
+        reached = [
+            any((sample[g] - sample[h]).norm(dim=-1).max() < 1e-9 for h in alive) for g in range(len(sample))
+        ]
+        runner_up = lead if all(reached) or sample.shape[1] > 1 else min(lead, narrowed)
+        narrowed = min(narrowed, lead)
         if sample.shape[1] > 1:
             costs = cost(sample[owners[0]])
             runner_up = min(runner_up, float(costs.max() - costs.min()) / 2)
@@ -232,3 +239,12 @@ def test_turns_about_z_are_what_a_revolution_adds(declare):
     assert along.tolist() == [0, 0, 5] and radial.tolist() == [3, 4, 0]
     turned = rotation_about_z(torch.tensor(math.pi / 2).double()) @ radial
     assert turned.tolist() == pytest.approx([-4, 3, 0])
+
+
+def test_a_keypoint_bound_by_anothers_choice_is_no_surer_than_that():
+    """C2: a tiny tilt exchanges both ends, and with them both sides."""
+    keypoints = [Keypoint("end", "centroid", Plane("x"), "l"), Keypoint("side", "centroid", Plane("y"), "w")]
+    chain = KeypointChain(keypoints, ["l", "w"], cyclic(2))
+    tilt = torch.tensor([[1, 0, 1e-4], [0, 1, 0], [-1e-4, 0, 1]], dtype=torch.float64)
+    _, margin = chain.choose(NearestToCamera(tilt), chain.canonical(metres(0.02, 0.03)))
+    assert margin.tolist() == pytest.approx([4e-6, 4e-6], rel=1e-6)

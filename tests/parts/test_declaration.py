@@ -191,3 +191,14 @@ def test_a_vertex_beside_the_symmetry_axes_is_refused():
 def test_the_message_of_a_bad_mirror_says_what_is_expected():
     with refused("orthonormal \\(3, 3\\) matrix with determinant -1"):
         KeypointChain([FACE, SIDE], "hw", cyclic(1), torch.eye(3, dtype=torch.float64))
+
+
+def test_a_circle_that_a_reflection_moves_alone_is_refused():
+    """The finite keypoints lie in the mirror plane, so nothing tells the two circles' bodies apart."""
+    keypoints = [
+        Keypoint("end", "centroid", Plane("x"), "l", 0.5),
+        Keypoint("lid", "centroid", Plane("z"), "h", 0.5),
+        Keypoint("ring", "centroid", Circle((0, 1, 1), (1, 0, 0)), "r"),
+    ]
+    with pytest.raises(ValueError, match="keypoint 'ring': a symmetry of the part moves its circle"):
+        KeypointChain(keypoints, ["l", "h", "r"], cyclic(1), reflection((0, 1, 0)))

@@ -54,7 +54,7 @@ def test_steps_of_many_instances_are_split_at_once():
     ],
 )
 def test_elements_that_carry_a_step_to_one_place_count_once(group, primitive, step, count):
-    images, member = distinct_images(primitive, vector(*step), group)
+    images, member = distinct_images(primitive, vector(*step)[None], group)
     assert images.shape == (count, 3, 3) and member.shape == (len(group),)
     assert torch.equal(images[0], torch.eye(3, dtype=torch.float64))
     assert member.bincount().tolist() == [len(group) // count] * count
@@ -64,7 +64,7 @@ def test_elements_that_carry_a_step_to_one_place_count_once(group, primitive, st
 
 def test_the_length_of_a_step_does_not_matter():
     for length in (1e-4, 1.0, 1e3):
-        images, _ = distinct_images(Polygon(6), vector(length, 0, 0), dihedral(6).rotations)
+        images, _ = distinct_images(Polygon(6), vector(length, 0, 0)[None], dihedral(6).rotations)
         assert len(images) == 6
 
 

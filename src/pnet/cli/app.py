@@ -16,6 +16,8 @@ from hydra.errors import HydraException, InstantiationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from pnet.cli.instantiate import trusted_modules
+
 Task = Callable[[DictConfig], None]
 # what a user can mend; anything else is a fault of ours and keeps its traceback
 EXPECTED = (ValueError, OSError, ModuleNotFoundError, HydraException, OmegaConfBaseException)
@@ -42,6 +44,8 @@ OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 def run_app(task: Task, config_name: str) -> None:
     """Run a command: compose its config, call the task, turn errors into one line and an exit code."""
     try:
+        if trusted_modules():  # modules of the user's own may lie in the working directory
+            sys.path.append(os.getcwd())
         folder = config_dir()
         _explain_bad_overrides(folder, config_name, sys.argv[1:])
         decorate = hydra.main(version_base="1.3", config_path=str(folder), config_name=config_name)

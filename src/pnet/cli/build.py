@@ -65,7 +65,13 @@ def build_data(cfg: DictConfig, part: ParametricPart) -> SceneDataModule:
 
 def identity(cfg: DictConfig) -> dict[str, str]:
     """What weights belong to: part, network and labels, as text that can be compared."""
-    groups = {"backbone": cfg.backbone, "model": cfg.model, "targets": cfg.data.targets}
+    part = {key: value for key, value in cfg.part.items() if key not in ("learning", "generalization")}
+    groups = {
+        "declaration": OmegaConf.create(part),
+        "backbone": cfg.backbone,
+        "model": cfg.model,
+        "targets": cfg.data.targets,
+    }
     texts = {name: OmegaConf.to_yaml(node, resolve=True) for name, node in groups.items()}
     return {"part": instantiate(cfg.part).name, "points": str(cfg.data.points), **texts}
 

@@ -1,7 +1,6 @@
 """Build objects from configs, from an allowlist only: a config file is data, not code."""
 
 import os
-import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -40,13 +39,18 @@ def instantiate(node: DictConfig, *args: Any, **kwargs: Any) -> Any:
 def allowed() -> tuple[str, ...]:
     """The prefixes that targets may have: pnet's own, and modules that the user names in the environment.
 
-    A config cannot extend it: whoever starts the command decides whose code runs. Such modules are also
-    looked for in the working directory.
+    A config cannot extend it: whoever starts the command decides whose code runs.
     """
+    return (*ALLOWED, *(f"{name}." for name in trusted_modules()))
+
+
+def trusted_modules() -> list[str]:
+    """The modules that the user names in the environment."""
     named = [word.strip() for word in os.environ.get(TRUSTED, "").split(",") if word.strip()]
-    if named and os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
-    return (*ALLOWED, *(f"{name.removesuffix('.')}." for name in named))
+    for name in named:
+        if not all(word.isidentifier() for word in name.split(".")):
+            raise ValueError(f"{TRUSTED}: {name!r} is no module's name, such as my_parts")
+    return named
 
 
 def _check(key: str, target: str) -> None:

@@ -1,10 +1,11 @@
 """Mean rotation modulo a symmetry group, robust against outliers."""
 
+import math
+
 import roma
 import torch
 from torch import Tensor
 
-from pnet.geometry.rigid import rotation_angle
 from pnet.geometry.symmetry import Symmetry, nearest_equivalent
 
 STARTS = 12  # hypotheses from which the climb to a mode starts
@@ -40,11 +41,11 @@ def mean_rotation(R: Tensor, weight: Tensor, symmetry: Symmetry, width: float) -
 
 
 def _starts(R: Tensor, weight: Tensor) -> Tensor:
-    """(..., s, 3, 3) the hypotheses of most weight, thinned out evenly."""
-    n = R.shape[-3]
-    order = torch.argsort(weight, dim=-1, descending=True, stable=True)[..., : max(1, (n + 1) // 2)]
-    pick = torch.linspace(0, order.shape[-1] - 1, min(STARTS, order.shape[-1])).round().long()
-    index = order[..., pick.to(order.device)]
+    """(..., s, 3, 3) of the hypotheses with weight the better half, thinned out evenly."""
+    order = torch.argsort(weight, dim=-1, descending=True, stable=True)
+    half = ((weight > 0).sum(-1, keepdim=True) + 1) // 2
+    share = torch.linspace(0, 1, STARTS, device=weight.device)
+    index = order.gather(-1, (share * (half - 1).clamp(min=0)).round().long())
     return R.gather(-3, index[..., None, None].expand(*index.shape, 3, 3))
 
 
@@ -52,5 +53,6 @@ def _nearness(R: Tensor, mean: Tensor, symmetry: Symmetry, width: float) -> tupl
     """Hypotheses aligned to every mean (..., s, n, 3, 3), and Tukey's weight of their angle (..., s, n)."""
     reference = mean[..., :, None, :, :]
     aligned = nearest_equivalent(R[..., None, :, :, :], reference, symmetry)
-    angle = rotation_angle(aligned, reference.expand_as(aligned))
-    return aligned, (1 - (angle / width).square()).clamp(min=0).square()
+    # ‖A − B‖ of rotations an angle θ apart is √8 sin(θ / 2)
+    half_sine = (aligned - reference).square().sum((-2, -1)).sqrt() / math.sqrt(8.0)
+    return aligned, (1 - (half_sine / math.sin(min(width, math.pi) / 2)).square()).clamp(min=0).square()

@@ -21,6 +21,7 @@ from pnet.geometry.symmetry import (
     SphericalSymmetry,
     Symmetry,
 )
+from pnet.scenes.store import write_atomically
 
 ROTATION_TOLERANCE = 1e-3
 _FINITE, _REVOLUTION, _SPHERE = "AffinePoseUtils", "RevolutionPoseUtils", "SphericalPoseUtils"
@@ -60,7 +61,7 @@ def write_poseutils(path: Path, space: PoseSpace) -> None:
             fields = {"type": _SPHERE}
     fields |= {"Rref2i": space.frame_R.tolist(), "tref2i": space.frame_t.tolist()}
     fields["distance_threshold"] = space.distance_threshold
-    path.write_text(json.dumps(fields, indent=2) + "\n", encoding="utf-8")
+    write_atomically(path, (json.dumps(fields, indent=2) + "\n").encode())
 
 
 def read_json(path: Path) -> Any:

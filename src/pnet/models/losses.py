@@ -79,7 +79,7 @@ class ParametricLoss:
         squared = error.square().sum(-1)
         if self._margin is not None:
             trust = 1 / (1 + self._margin / margin)
-            squared = squared * (trust.square() if self._norm is Norm.EACH else trust)
+            squared = squared * (trust if self._norm is Norm.SQUARED else trust.square())
         if self._norm is Norm.EACH:
             return self._mean(squared) * error.shape[-2]
         return self._mean(squared.sum(-1))

@@ -77,7 +77,7 @@ class ParametricPart(ABC):
                 self.symmetry,
                 self.mirror,
                 self.centroid,
-                typical=self.grids["L"][0],
+                typical=np.concatenate(list(self.grids.values())),
             )
         except ValueError as fault:
             raise ValueError(f"{self.name}: {fault}") from fault
@@ -105,16 +105,18 @@ class ParametricPart(ABC):
             ValueError: where it vanishes or falls apart.
         """
         mesh, centroid = self._construct(parameters), self.centroid(parameters[None])[0]
-        if mesh.body_count > 1:
-            raise ValueError(
-                f"{self.name}: the solid falls into {mesh.body_count} pieces with {self.text(parameters)}; "
-                "a cut goes through it, or added shapes don't touch"
-            )
+        if mesh.body_count > 1:  # an inner void is a body too, turned inside out
+            count = sum(piece.volume > 0 for piece in mesh.split(only_watertight=False))
+            if count > 1:
+                raise ValueError(
+                    f"{self.name}: the solid falls into {count} pieces with {self.text(parameters)}; "
+                    "a cut goes through it, or added shapes don't touch"
+                )
         if self.closed_form and np.abs(mesh.center_mass - centroid).max() > 1e-6 * mesh.scale:
             raise ValueError(
                 f"{self.name}: shapes overlap, or are cut beyond their borders, with "
                 f"{self.text(parameters)}, though not with the first part object; "
-                "set closed_form_centroid = False"
+                "set closed_form_centroid to false"
             )
         return mesh.apply_translation(-centroid)
 
@@ -148,7 +150,8 @@ class ParametricPart(ABC):
             are cut beyond their borders, else from the mesh.
         """
         if not self.closed_form:
-            return np.stack([self._mesh_centroid(tuple(row)) for row in parameters.tolist()])
+            rows = [self._mesh_centroid(tuple(row)) for row in parameters.tolist()]
+            return np.stack(rows) if rows else np.zeros((0, 3))
         volume, moment = solid(self.solid(parameters)).signed_volume_and_moment(self.sections)
         centroid = moment / volume[..., None]
         return np.broadcast_to(centroid, (len(parameters), 3))

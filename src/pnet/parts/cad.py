@@ -141,8 +141,12 @@ def read_mesh(path: Path, unit: str) -> trimesh.Trimesh:
         raise ValueError(
             f"{path}: the mesh is not watertight; close its gaps in a CAD program or with trimesh.repair"
         )
-    if mesh.volume < 0:
-        mesh.invert()
+    if not mesh.is_winding_consistent or mesh.volume < 0:
+        trimesh.repair.fix_normals(mesh, multibody=True)  # type: ignore[no-untyped-call]
+    if not mesh.is_volume:
+        raise ValueError(
+            f"{path}: the faces' directions contradict each other; let a CAD program write it anew"
+        )
     mesh.apply_transform(np.diag([UNITS[unit]] * 3 + [1.0]))
     return mesh
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pnet.geometry.rigid import apply_pose
-from pnet.geometry.symmetry import RevolutionSymmetry, SphericalSymmetry
+from pnet.geometry.symmetry import RevolutionSymmetry, SphericalSymmetry, nearest_equivalent
 from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointChoice
 from pnet.parts.solids import manifold
@@ -49,7 +49,9 @@ def check_part(part: ParametricPart, samples: int, seed: int = 0) -> Iterator[Ch
     off = max(float(np.linalg.norm(mesh.center_mass)) for mesh in meshes)
     yield Check("volume centroid is the origin", off < 1e-9, f"{1000 * off:.1e} mm off")
     yield _pieces_check(part, ends, meshes)
-    yield _symmetry_check(part, meshes[0])
+    yield _symmetry_check(part, meshes)
+    if closed:
+        yield _missing_symmetry_check(part, meshes)
     error = round_trip_error(part, *random_instances(part, samples, seed))
     yield Check("keypoints give the parameters back", error < ROUND_TRIP, f"{1000 * error:.1e} mm at most")
 
@@ -103,18 +105,38 @@ def _pieces_check(part: ParametricPart, ends: Points, meshes: list[trimesh.Trime
     return Check(name, passed, f"{count} pieces ({filled} with holes filled), volume {100 * worst:.2g}% off")
 
 
-def _symmetry_check(part: ParametricPart, mesh: trimesh.Trimesh) -> Check:
+def _symmetry_check(part: ParametricPart, meshes: list[trimesh.Trimesh]) -> Check:
     """Every symmetry element must carry the solid onto itself; turns by one side of the circles' polygons."""
+    name = "symmetry carries the solid onto itself"
     elements = part.chain.group.numpy()
     if isinstance(part.symmetry, RevolutionSymmetry | SphericalSymmetry):
-        angle = 2 * np.pi / part.sections
-        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-        elements = np.concatenate([elements, turn[None]])
-    name, solid, worst = "symmetry carries the solid onto itself", manifold(mesh), 0.0
-    if solid.volume() <= 0:
+        elements = np.concatenate([elements, _turn("z", 2 * np.pi / part.sections)[None]])
+    if any(manifold(mesh).volume() <= 0 for mesh in meshes):
         return Check(name, False, "the mesh is open")
-    for element in elements[1:]:
-        moved = solid.transform(np.c_[element, np.zeros(3)])
-        worst = max(worst, 1 - (solid ^ moved).volume() / solid.volume())
+    worst = max(_left_over(mesh, element) for mesh in meshes for element in elements)
     # where polygons stand for circles a turn by another angle leaves a little over
-    return Check(name, worst < 0.02, f"{100 * worst:.2g}% of the volume left over")
+    return Check(name, worst < 0.005, f"{100 * worst:.2g}% of the volume left over")
+
+
+def _missing_symmetry_check(part: ParametricPart, meshes: list[trimesh.Trimesh]) -> Check:
+    """A turn that carries every size's solid onto itself must be declared: else labels are ambiguous."""
+    name, found = "no rotation symmetry is missing", []
+    for axis in "xyz":
+        for fraction in (2, 3, 4, 5, 6):
+            turn = _turn(axis, 2 * np.pi / fraction)
+            nearest = nearest_equivalent(torch.eye(3).double(), torch.from_numpy(turn), part.symmetry)
+            declared = bool((nearest - torch.from_numpy(turn)).abs().max() < 1e-6)
+            if not declared and all(_left_over(mesh, turn) < 1e-6 for mesh in meshes):
+                found.append(f"1/{fraction} turn about {axis}")
+    return Check(name, not found, ", ".join(found) + " is one" if found else "turns about x, y, z tried")
+
+
+def _left_over(mesh: trimesh.Trimesh, element: Points) -> float:
+    """Share of the volume that an orthonormal matrix carries out of the solid."""
+    solid = manifold(mesh)
+    return float(1 - (solid ^ solid.transform(np.c_[element, np.zeros(3)])).volume() / solid.volume())
+
+
+def _turn(axis: str, angle: float) -> Points:
+    unit = torch.tensor([float(axis == name) for name in "xyz"], dtype=torch.float64)
+    return np.asarray(roma.rotvec_to_rotmat(angle * unit))

@@ -19,7 +19,10 @@ def convex_difference(body: Points, cutter: Points) -> list[Points]:
         Arrays (n_i, 3) of corners, disjoint but for their borders; the body itself where they don't overlap;
         nothing where the cutter holds it all.
     """
-    smallest = SLIVER * ConvexHull(body).volume
+    try:
+        smallest = SLIVER * ConvexHull(body).volume
+    except QhullError:  # the body has no volume
+        return []
     pieces, rest = [], body
     for normal, offset in _facets(cutter):
         beyond, rest = _split(rest, normal, offset, smallest)

@@ -54,6 +54,22 @@ def check_declaration(chain: KeypointChain, symmetry: Symmetry, template: Tensor
         raise ValueError("a sphere's keypoints must lie on spheres about its centroid")
 
 
+def check_circles(chain: KeypointChain) -> None:
+    """A reflection that leaves the finite keypoints in place must leave the circles in place too.
+
+    Else two label sets differ in a circle alone, which the fit takes from the observation.
+    """
+    if len(chain.chiralities) > 1:
+        return
+    for element in range(len(chain.group)):
+        moved = [i for i in range(len(chain)) if chain.moves(element, i)]
+        if moved and not any(chain.is_finite[i] for i in moved):
+            raise ValueError(
+                f"keypoint {chain.names[moved[0]]!r}: a symmetry of the part moves its circle, but no "
+                "keypoint that is not free on a circle; add one that it moves"
+            )
+
+
 def _check_measure(keypoint: Keypoint, parameters: Sequence[str]) -> None:
     where = f"keypoint {keypoint.name!r}"
     if keypoint.parameter is not None:

@@ -38,6 +38,7 @@ from pnet.parts.solids import (
     cone,
     cylinder,
     moved,
+    outline,
     polygon,
 )
 
@@ -58,7 +59,7 @@ class DeclaredPart(ParametricPart):
             {rotations: [matrices]}. mirror: normal of a mirror plane through the centroid ("x", "y", …), or
             None.
         require: comparisons that valid parameters satisfy, such as "d > 2 * r".
-        learning, generalization, sections: see `ParametricPart`.
+        learning, generalization, sections, closed_form_centroid: see `ParametricPart`.
     """
 
     def __init__(
@@ -73,7 +74,9 @@ class DeclaredPart(ParametricPart):
         mirror: str | None = None,
         require: Sequence[str] = (),
         sections: int = 48,
+        closed_form_centroid: bool | None = None,
     ) -> None:
+        self.closed_form_centroid = closed_form_centroid
         self.name = name
         try:
             check_kind(Sequence, "a list", parameters=parameters, solid=solid)
@@ -228,10 +231,11 @@ def _sphere(value: Length, radius: Expression) -> Shape:
     return Ball(value(radius))
 
 
-def _corners(value: Length, outline: Sequence[Sequence[Expression]]) -> Points:
-    return np.stack([np.stack([value(x) for x in corner], -1) for corner in outline], -2)
+def _corners(value: Length, corners: Sequence[Sequence[Expression]]) -> Points:
+    return outline([(value(x), value(y)) for x, y in corners])
 
 
+MOST_TURNS = 48  # beyond it a part is a revolution for any camera
 # shape → how it is built, and its fields: () one length, (2,) from and to, (−1, 2) corners
 SHAPES: dict[str, tuple[Callable[..., Shape], dict[str, tuple[int, ...] | str]]] = {
     "cylinder": (_cylinder, {"radius": (), "low": (), "high": ()}),
@@ -321,13 +325,13 @@ def symmetry_from(value: str | Fields) -> Symmetry:
         "revolution_equal_ends": RevolutionSymmetry(rotoreflection=True),
         "sphere": SphericalSymmetry(),
     }
-    choices = [*named, "{cyclic: n}", "{dihedral: n}", "{rotations: [matrices]}"]
+    choices = [*named, "{cyclic: n}", "{dihedral: n}" + f" (n up to {MOST_TURNS})", "{rotations: [matrices]}"]
     if isinstance(value, str) and value in named:
         return named[value]
     match value:
-        case {"cyclic": int(n), **others} if n >= 1 and not others:
+        case {"cyclic": int(n), **others} if 1 <= n <= MOST_TURNS and not others:
             return cyclic(n)
-        case {"dihedral": int(n), **others} if n >= 1 and not others:
+        case {"dihedral": int(n), **others} if 1 <= n <= MOST_TURNS and not others:
             return dihedral(n)
         case {"rotations": rotations, **others} if not others:
             try:

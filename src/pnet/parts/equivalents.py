@@ -20,16 +20,17 @@ def along_and_radial(primitive: Primitive, step: Tensor) -> tuple[Tensor, Tensor
     return along, step - along
 
 
-def distinct_images(primitive: Primitive, step: Tensor, group: Tensor) -> tuple[Tensor, Tensor]:
-    """Which symmetry elements move a keypoint's step to different places.
+def distinct_images(primitive: Primitive, steps: Tensor, group: Tensor) -> tuple[Tensor, Tensor]:
+    """Which symmetry elements move a keypoint, seen from its reference, to different places.
 
     Args:
-        step: (3,) from the reference. group: (g, 3, 3).
+        steps: (n, 3) from the reference, for several sizes. group: (g, 3, 3).
     Returns:
         images (q, 3, 3): one element for each place; member (g,): which of them every element equals.
     """
-    along, _ = along_and_radial(primitive, step / torch.linalg.vector_norm(step))
-    mark = group @ along
+    unit = steps / torch.linalg.vector_norm(steps, dim=-1, keepdim=True)
+    along, _ = along_and_radial(primitive, unit)
+    mark = (group @ along.mT).flatten(1)
     if primitive.freedom is Freedom.TURN:  # the circle's plane counts too
         axis = group @ primitive.axis.to(group)
         mark = torch.cat([mark, (axis[:, :, None] * axis[:, None, :]).flatten(1)], 1)

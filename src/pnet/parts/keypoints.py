@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from pnet.geometry.symmetry import Symmetry, full_group
 from pnet.parts.choice import Judge, KeypointChoice, KeypointRule, NearestToCamera, first_by
-from pnet.parts.declaration import check_declaration, check_names
+from pnet.parts.declaration import check_circles, check_declaration, check_names
 from pnet.parts.equivalents import allowed, along_and_radial, distinct_images, images_of
 from pnet.parts.expressions import Expression, length
 from pnet.parts.primitives import Circle, Corner, Direction, Freedom, Plane, Primitive
@@ -91,7 +92,8 @@ class KeypointChain:
         symmetry, mirror: the part's; see `full_group`.
         centroid: parameters (n, k) → (n, 3) the centroid in the frame of construction, metres; None: its
             origin.
-        typical: (k,) parameters of some part object, metres; tells which symmetry elements move a keypoint.
+        typical: (n, k) parameters of part objects, metres; they tell which symmetry elements move a
+            keypoint, and stand in where estimated sizes make no solid.
 
     Attributes:
         reference: (m) place of each keypoint's reference among centroid, keypoint 0, keypoint 1, …
@@ -116,15 +118,18 @@ class KeypointChain:
         self._centroid = centroid
         known = [CENTROID, *self.names]
         self.reference = [known.index(keypoint.reference) for keypoint in self.keypoints]
-        size = np.linspace(1.0, 1.3, len(self.parameters)) if typical is None else typical
+        sizes = np.linspace(1.0, 1.3, len(self.parameters)) if typical is None else typical
+        self._typical = np.atleast_2d(sizes)
         self.is_finite = self._find_finite()
-        template = self.canonical(torch.from_numpy(size))
-        check_declaration(self, symmetry, template)
+        some = self._typical[[0, len(self._typical) // 2, -1]]  # a place may be special for one size
+        templates = self.canonical(torch.from_numpy(some))
+        check_declaration(self, symmetry, templates[0])
         self._equivalents = [
-            distinct_images(keypoint.primitive, step, self.group)
-            for keypoint, step in zip(self.keypoints, self.steps(template).unbind(-2), strict=True)
+            distinct_images(keypoint.primitive, steps, self.group)
+            for keypoint, steps in zip(self.keypoints, self.steps(templates).unbind(-2), strict=True)
         ]
-        self.chiralities = self._find_chiralities(template, mirror)
+        self.chiralities = self._find_chiralities(templates[0], mirror)
+        check_circles(self)
 
     def __len__(self) -> int:
         """m, the number of keypoints."""
@@ -134,6 +139,10 @@ class KeypointChain:
     def names(self) -> list[str]:
         """The keypoints' names in order."""
         return [keypoint.name for keypoint in self.keypoints]
+
+    def moves(self, element: int, keypoint: int) -> bool:
+        """Whether a symmetry element moves a keypoint, or its circle, as seen from its reference."""
+        return int(self._equivalents[keypoint][1][element]) != int(self._equivalents[keypoint][1][0])
 
     def equivalents(self, keypoint: int) -> int:
         """How many places symmetry elements that keep the reference in place carry a keypoint to."""
@@ -194,24 +203,30 @@ class KeypointChain:
             template: (..., m, 3) canonical keypoints, part frame, metres.
         Returns:
             keypoints (..., m, 3) metres, part frame; margin (..., m) metres: how much worse the runner-up is,
-            for this keypoint or for one that it hangs on. On a circle or sphere runners-up are arbitrarily
+            for this keypoint, one that it hangs on, or one whose choice binds it. On a circle or sphere
+            runners-up are arbitrarily
             near: half the cost's range over it stands for the margin.
         """
         zero = torch.zeros_like(template[..., 0, :])
         chosen, margins = [zero], [torch.full_like(zero[..., 0], torch.inf)]
         alive: Tensor | None = None  # (..., g) the symmetry elements that agree with the choices so far
+        narrowed = margins[0]  # (...) the smallest lead of the choices that left only those
         for i, step in enumerate(self.steps(template).unbind(-2)):
             images, member = self._equivalents[i]
             places, margin = self._candidates(i, judge, chosen[self.reference[i]], step)
             if len(images) == 1:
                 place, margin = places[..., 0, :], margin[..., 0]
             else:
+                member = member.to(places.device)
                 may = allowed(alive, member, places[..., 0])
                 index, lead = first_by(judge.keys(places), may)
                 agree = member == index[..., None]
                 alive = agree if alive is None else alive & agree
                 place = places.gather(-2, index[..., None, None].expand(*index.shape, 1, 3))[..., 0, :]
                 margin = torch.minimum(lead, margin.gather(-1, index[..., None])[..., 0])
+                # what an earlier choice has ruled out would come back if that choice had been another
+                margin = torch.where(may.all(-1), margin, torch.minimum(margin, narrowed))
+                narrowed = torch.minimum(narrowed, lead)
             chosen.append(place)
             margins.append(torch.minimum(margin, margins[self.reference[i]]))
         return torch.stack(chosen[1:], -2), torch.stack(margins[1:], -1)
@@ -329,13 +344,20 @@ class KeypointChain:
         return [eye] if bool((moved < 1e-6 * finite.abs().max()).any()) else [eye, mirror.double()]
 
     def _length(self, expression: Expression, parameters: Tensor) -> Tensor:
-        value = length(expression, self.parameters, parameters.detach().cpu().double().numpy())
-        return torch.from_numpy(np.array(value)).to(parameters)
+        value = self._forgiving(partial(length, expression, self.parameters), parameters)
+        return torch.from_numpy(np.array(value)).to(parameters).reshape(parameters.shape[:-1])
 
     def _origin(self, parameters: Tensor) -> Tensor:
         """(..., 3) the centroid in the frame of construction, metres."""
         if self._centroid is None:
             return torch.zeros_like(parameters[..., :1]).expand(*parameters.shape[:-1], 3)
-        sizes = parameters.detach().cpu().double().reshape(-1, len(self.parameters)).numpy()
-        place = torch.from_numpy(np.array(self._centroid(sizes))).to(parameters)
+        place = torch.from_numpy(np.array(self._forgiving(self._centroid, parameters))).to(parameters)
         return place.reshape(*parameters.shape[:-1], 3)
+
+    def _forgiving(self, value: Callable[[Points], Points], parameters: Tensor) -> Points:
+        """A value of (n, k) sizes; where estimated ones make no solid, of the nearest among typical sizes."""
+        sizes = parameters.detach().cpu().double().reshape(-1, len(self.parameters)).numpy()
+        try:
+            return value(sizes)
+        except ValueError:
+            return value(np.clip(sizes, self._typical.min(0), self._typical.max(0)))

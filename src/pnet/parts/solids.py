@@ -8,6 +8,7 @@ vertices on the circle.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import pairwise
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from pnet.parts.clipping import convex_difference
 
 Points = NDArray[np.float64]
+PICOMETRES = 12  # decimals: 0.4 h and h - 0.6 h must touch, whatever their last bits
 Extent = tuple[Points | float, Points | float]
 # where a shape's own z goes: columns are the images of its x, y and z
 _FRAMES = {
@@ -53,6 +55,10 @@ class Shape(ABC):
     def __sub__(self, other: Shape | Solid) -> Solid:
         return solid(self) - other
 
+    def cutter_sections(self, sections: int) -> int:
+        """Polygon sides of a circle where the shape is cut out of convex pieces."""
+        return sections
+
     def volume_and_moment(self, sections: int) -> tuple[Points, Points]:
         """Volume (...), m³, and first moment (..., 3), m⁴, about the origin of construction."""
         volume, moment = self.own_volume_and_moment(sections)
@@ -65,8 +71,9 @@ class Shape(ABC):
 
     def mesh(self, sections: int) -> trimesh.Trimesh:
         """Watertight mesh of one size where it is placed."""
-        mesh = self.own_mesh(sections)
-        return mesh.apply_transform(self._matrix())
+        mesh = self.own_mesh(sections).apply_transform(self._matrix())
+        mesh.vertices = np.round(mesh.vertices, PICOMETRES)
+        return mesh
 
     def pieces(self, sections: int) -> list[Points]:
         """Convex pieces of one size where they are placed."""
@@ -156,7 +163,7 @@ class Revolution(Shape):
     def own_pieces(self, sections: int) -> list[Points]:
         """Of every slab between two corner heights the frusta, or the sectors of a ring."""
         pieces: list[Points] = []
-        for low, high, inner, outer in _slabs(self.profile):
+        for low, high, inner, outer in _slabs(np.round(self.profile, PICOMETRES)):
             pieces += _ring_pieces(low, high, inner, outer, sections)
         return pieces
 
@@ -180,6 +187,10 @@ class Ball(Shape):
     def own_mesh(self, sections: int) -> trimesh.Trimesh:
         """The turned half circle."""
         return self._revolution(sections).own_mesh(sections)
+
+    def cutter_sections(self, sections: int) -> int:
+        """A ball's facets grow with the square, and every one makes a piece: a few must do."""
+        return min(sections, 12)
 
     def own_pieces(self, sections: int) -> list[Points]:
         """One piece: it is convex."""
@@ -258,7 +269,7 @@ class Solid:
             if operation is Operation.ADD:
                 pieces += shape.pieces(sections)
             elif operation is Operation.CUT or not fill_holes:
-                for cutter in shape.pieces(sections):
+                for cutter in shape.pieces(shape.cutter_sections(sections)):
                     pieces = [rest for piece in pieces for rest in convex_difference(piece, cutter)]
         return pieces
 
@@ -274,7 +285,7 @@ def hole(shape: Shape) -> Solid:
 
 
 def cylinder(radius: Points | float, low: Points | float, high: Points | float) -> Revolution:
-    """A round bar along z from low to high; `.moved(axis=…, at=…)` puts it elsewhere."""
+    """A round bar along z from low to high; `moved(…, axis, at)` puts it elsewhere."""
     return cone(radius, radius, low, high)
 
 
@@ -282,9 +293,7 @@ def cone(
     low_radius: Points | float, high_radius: Points | float, low: Points | float, high: Points | float
 ) -> Revolution:
     """A cone or frustum along z; one of the radii may be 0."""
-    radius = np.broadcast_arrays(np.zeros(()), low_radius, high_radius, np.zeros(()))
-    height = np.broadcast_arrays(low, low, high, high)
-    return Revolution(np.stack(np.broadcast_arrays(np.stack(radius, -1), np.stack(height, -1)), -1))
+    return Revolution(outline([(0, low), (low_radius, low), (high_radius, high), (0, high)]))
 
 
 def prism(outline: Points, low: Points | float, high: Points | float) -> Extrusion:
@@ -294,9 +303,13 @@ def prism(outline: Points, low: Points | float, high: Points | float) -> Extrusi
 
 def box(x: Extent, y: Extent, z: Extent) -> Extrusion:
     """A cuboid by its extents (from, to), metres."""
-    corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
-    outline = np.stack([np.stack(np.broadcast_arrays(*corner), -1) for corner in corners], -2)
-    return Extrusion(outline.astype(float), *z)
+    return Extrusion(outline([(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]), *z)
+
+
+def outline(corners: Sequence[tuple[Points | float, Points | float]]) -> Points:
+    """Corners whose coordinates are numbers or (...) arrays as one array (..., n, 2)."""
+    values = np.broadcast_arrays(*(np.asarray(x, float) for corner in corners for x in corner))
+    return np.stack(values, -1).reshape(*values[0].shape, len(corners), 2)
 
 
 def moved(shape: Shape, axis: str = "z", at: tuple[Points | float, ...] = (0.0, 0.0, 0.0)) -> Shape:

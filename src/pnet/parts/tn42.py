@@ -3,13 +3,11 @@
 The publication shows only a picture; the sizes are ours.
 """
 
-import numpy as np
-
 from pnet.geometry.symmetry import cyclic, reflection
 from pnet.parts.base import ParametricPart, Points
 from pnet.parts.keypoints import Keypoint
 from pnet.parts.primitives import Corner, Plane
-from pnet.parts.solids import Shape, moved, prism
+from pnet.parts.solids import Shape, moved, outline, prism
 
 SMALL_END = 0.006  # height of the small end, metres
 
@@ -39,7 +37,5 @@ class TN42(ParametricPart):
     def solid(self, parameters: Points) -> Shape:
         """The trapezoid in the zx plane, extruded along y."""
         length, a, w = self.split(parameters)
-        zero = 0 * a
-        corners = [(zero, zero), (a, zero), (zero + SMALL_END, length), (zero, length)]  # z, x
-        outline = np.stack([np.stack(corner, -1) for corner in corners], -2)
-        return moved(prism(outline, -w / 2, w / 2), axis="y")
+        side = outline([(0, 0), (a, 0), (SMALL_END, length), (0, length)])  # z, x
+        return moved(prism(side, -w / 2, w / 2), axis="y")
