@@ -90,7 +90,7 @@ def test_thirty_percent_of_wild_votes_hardly_matter(any_part, random_poses, rand
     noise = torch.randn(votes.keypoints.shape, generator=generator, dtype=torch.float64)
     noisy = votes.keypoints + noise * torch.where(wild, 0.03, 0.0005)
     agreed = FOLDED(any_part, PointVotes(votes.centroid, noisy, votes.owner, 5, votes.reliable))
-    assert math.degrees(error_modulo(any_part.symmetry, recovered(any_part, agreed), R)) < 2
+    assert math.degrees(error_modulo(any_part.symmetry, recovered(any_part, agreed), R)) < 2.5
     assert float((agreed.parameters - sizes).abs().max()) < 0.0003
 
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pnet.engine.estimator import NetworkEstimator
 
 CONFIG = "config.yaml"  # a run's settings as they were given, interpolations and all
+UNLEARNT = ("learning", "generalization", "sections")  # keys of a part that weights don't depend on
 RESOLVED = "resolved.yaml"  # the same, resolved: what evaluation reads
 
 
@@ -65,7 +66,7 @@ def build_data(cfg: DictConfig, part: ParametricPart) -> SceneDataModule:
 
 def identity(cfg: DictConfig) -> dict[str, str]:
     """What weights belong to: part, network and labels, as text that can be compared."""
-    part = {key: value for key, value in cfg.part.items() if key not in ("learning", "generalization")}
+    part = {key: value for key, value in cfg.part.items() if key not in UNLEARNT}
     groups = {
         "declaration": OmegaConf.create(part),
         "backbone": cfg.backbone,
