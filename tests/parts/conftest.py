@@ -1,10 +1,13 @@
-"""Chains of keypoints that between them have every freedom and every kind of symmetry."""
+"""Chains of keypoints that between them have every freedom and every kind of symmetry; checks of solids."""
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import roma
 import torch
+import trimesh
+from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from pnet.geometry.symmetry import (
@@ -15,9 +18,12 @@ from pnet.geometry.symmetry import (
     dihedral,
     reflection,
 )
-from pnet.parts.keypoints import Keypoint, KeypointChain, cone_keypoints
+from pnet.parts.keypoints import KeypointChain
 from pnet.parts.primitives import Circle, Corner, Cylinder, Plane, Polygon, Sphere
+from pnet.parts.selection import Keypoint, cone_keypoints
+from pnet.parts.solids import Solid
 
+SECTIONS = 24  # of the circles in test_shapes and test_solids
 Declaration = tuple[list[Keypoint], str, Symmetry, Tensor | None]
 NUT = [
     Keypoint("face", "centroid", Plane("z"), "h", 0.5),
@@ -136,3 +142,24 @@ def symmetries() -> Callable[[KeypointChain], Tensor]:
         return chain.group
 
     return make
+
+
+@pytest.fixture(scope="session")
+def polygon_area() -> Callable[..., float]:
+    """Area of a regular polygon by its circumradius."""
+    return lambda radius, sections=SECTIONS: sections / 2 * radius**2 * np.sin(2 * np.pi / sections)
+
+
+@pytest.fixture(scope="session")
+def check_pieces() -> Callable[..., list[np.ndarray]]:
+    """Each piece is its own hull's corners; their union has the volume."""
+
+    def check(body: Solid, volume: float, fill_holes: bool = False) -> list[np.ndarray]:
+        pieces = body.pieces(SECTIONS, fill_holes)
+        hulls = [trimesh.convex.convex_hull(piece) for piece in pieces]
+        for piece, hull in zip(pieces, hulls, strict=True):
+            assert len(ConvexHull(piece).vertices) <= len(piece) and hull.volume > 0
+        assert trimesh.boolean.union(hulls, engine="manifold").volume == pytest.approx(volume, rel=0.01)
+        return pieces
+
+    return check

@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 
 from pnet.geometry.symmetry import cyclic
 from pnet.parts.base import ParametricPart
-from pnet.parts.keypoints import Keypoint
 from pnet.parts.primitives import Plane
-from pnet.parts.solids import Ball, box, cylinder, hole, moved
+from pnet.parts.selection import Keypoint
+from pnet.parts.shapes import Ball
+from pnet.parts.solids import box, cylinder, hole, moved
 
 MM = 0.001
 

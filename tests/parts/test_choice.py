@@ -12,8 +12,9 @@ from torch import Tensor
 from pnet.geometry.symmetry import cyclic, rotation_about_z
 from pnet.parts.choice import KeypointChoice, KeypointRule, NearestToCamera, NearestToPoint, first_by
 from pnet.parts.equivalents import along_and_radial
-from pnet.parts.keypoints import Keypoint, KeypointChain
+from pnet.parts.keypoints import KeypointChain
 from pnet.parts.primitives import Freedom, Plane
+from pnet.parts.selection import Keypoint
 
 TURNS = 2880
 DOWN = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))  # camera looks along part -z

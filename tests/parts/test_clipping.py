@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from pnet.parts.clipping import convex_difference
-from pnet.parts.solids import cone, cylinder, extrude_points, moved, polygon
+from pnet.parts.shapes import extrude_points, polygon
+from pnet.parts.solids import cone, cylinder, moved
 
 CUBE = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T.astype(float)
 

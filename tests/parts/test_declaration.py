@@ -12,8 +12,9 @@ from pnet.geometry.symmetry import (
     dihedral,
     reflection,
 )
-from pnet.parts.keypoints import Keypoint, KeypointChain, select_keypoints
+from pnet.parts.keypoints import KeypointChain
 from pnet.parts.primitives import Circle, Corner, Cylinder, Plane, Polygon, Sphere
+from pnet.parts.selection import Keypoint, select_keypoints
 
 FACE = Keypoint("face", "centroid", Plane("z"), "h", 0.5)
 SIDE = Keypoint("side", "centroid", Plane("x"), "w")

@@ -1,7 +1,5 @@
 """Keypoints from parameters and back, and what the chain tells the fit."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -11,8 +9,9 @@ from hypothesis import strategies as st
 from pnet.geometry.rigid import apply_pose
 from pnet.geometry.symmetry import RevolutionSymmetry, SphericalSymmetry, cyclic, dihedral, reflection
 from pnet.parts.choice import KeypointChoice, KeypointRule, NearestToCamera, NearestToPoint
-from pnet.parts.keypoints import Keypoint, KeypointChain, cone_keypoints, select_keypoints
+from pnet.parts.keypoints import KeypointChain
 from pnet.parts.primitives import Circle, Corner, Cylinder, Plane, Sphere
+from pnet.parts.selection import Keypoint
 
 CHOICES = {
     "equation 1": KeypointChoice(),
@@ -89,19 +88,6 @@ def test_the_mean_stands_where_several_keypoints_measure_one_parameter():
     observed = torch.tensor([[0, 0, 0.01], [0, 0.014, 0], [0.005, 0, 0.01]], dtype=torch.float64)
     found = chain.parameters_from_keypoints(torch.zeros(3).double(), observed)
     assert found.tolist() == pytest.approx([(0.005 + 0.014 / 2) / 2, 0.02])
-
-
-def test_a_cone_is_measured_from_its_base():
-    """Base centre 3 below the centroid, radius 2, height 12: the rule breaks the apex angle in two."""
-    base = Keypoint("base", "centroid", Plane("-z", at=0))
-    keypoints = [base, *cone_keypoints("rim", "tip", reference="base", axis="z", radius="r", height="h")]
-    chain = KeypointChain(
-        keypoints, ["r", "h"], RevolutionSymmetry(), None, lambda p: p[:, 1:] / 4 * np.array([[0, 0, 1]])
-    )
-    base, rim, tip = chain.canonical(torch.tensor([0.002, 0.012]).double())
-    assert base.tolist() == pytest.approx([0, 0, -0.003])
-    assert rim.norm().item() == pytest.approx(math.hypot(0.002, 0.003)) and rim[2] == base[2]
-    assert tip.tolist() == pytest.approx([0, 0, 0.009])
 
 
 def test_a_corner_stands_where_it_is_declared_less_the_centroid():
@@ -217,17 +203,6 @@ def test_a_keypoint_on_a_circle_is_not_finite_nor_is_one_that_hangs_on_it(declar
         "rim": False,
         "floor": False,
     }
-
-
-def test_keypoints_may_be_declared_in_any_order():
-    declared = [
-        Keypoint("rim", "top", Circle("z"), "r"),
-        Keypoint("top", "base", Plane("z"), "h"),
-        Keypoint("base", "centroid", Plane("-z", at=5)),
-    ]
-    assert [keypoint.name for keypoint in select_keypoints(declared, ["r", "h"])] == ["base", "top", "rim"]
-    chain = KeypointChain(declared, ["r", "h"], RevolutionSymmetry())
-    assert chain.reference == [0, 1, 2] and len(chain) == 3
 
 
 def test_a_sphere_has_one_keypoint_and_one_parameter(rotations):

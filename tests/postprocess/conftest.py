@@ -19,9 +19,10 @@ from pnet.geometry.symmetry import (
     reflection,
 )
 from pnet.parts.base import ParametricPart, Points
-from pnet.parts.keypoints import Keypoint
 from pnet.parts.primitives import Plane, Sphere
-from pnet.parts.solids import Ball, Shape, Solid, box, moved
+from pnet.parts.selection import Keypoint
+from pnet.parts.shapes import Ball, Shape
+from pnet.parts.solids import Solid, box, moved
 from pnet.parts.tn16 import TN16
 from pnet.parts.tn42 import TN42
 

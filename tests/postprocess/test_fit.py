@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from pnet.geometry.rigid import apply_pose, axis_angle_between
 from pnet.geometry.symmetry import RevolutionSymmetry, SphericalSymmetry, cyclic
 from pnet.parts.choice import KeypointChoice, KeypointRule, NearestToPoint
-from pnet.parts.keypoints import Keypoint, KeypointChain
+from pnet.parts.keypoints import KeypointChain
 from pnet.parts.primitives import Plane
+from pnet.parts.selection import Keypoint
 from pnet.postprocess.fit import fit_pose
 
 CAMERA, CANONICAL, POINT = KeypointRule.CAMERA, KeypointRule.CANONICAL, KeypointRule.POINT

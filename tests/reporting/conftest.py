@@ -10,9 +10,10 @@ import torch
 from pnet.geometry.camera import Camera
 from pnet.geometry.symmetry import RevolutionSymmetry, SphericalSymmetry
 from pnet.parts.base import ParametricPart
-from pnet.parts.keypoints import Keypoint
 from pnet.parts.primitives import Plane, Sphere
-from pnet.parts.solids import Ball, cylinder
+from pnet.parts.selection import Keypoint
+from pnet.parts.shapes import Ball
+from pnet.parts.solids import cylinder
 from pnet.parts.tn34 import TN34
 from pnet.parts.tn42 import TN42
 from pnet.records import Detections, Scene, SceneId

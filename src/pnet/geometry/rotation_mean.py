@@ -9,7 +9,8 @@ from torch import Tensor
 from pnet.geometry.symmetry import Symmetry, nearest_equivalent
 
 STARTS = 12  # hypotheses from which the climb to a mode starts
-ROUNDS = 12  # of re-weighting
+SUPPORTERS = 64  # the first hypotheses, by which starts are compared
+ROUNDS = 10  # of re-weighting
 
 
 def mean_rotation(R: Tensor, weight: Tensor, symmetry: Symmetry, width: float) -> Tensor:
@@ -20,15 +21,17 @@ def mean_rotation(R: Tensor, weight: Tensor, symmetry: Symmetry, width: float) -
     chordal metric; the climb starts at several hypotheses and the one with the most support wins.
 
     Args:
-        R: (..., n, 3, 3) hypotheses, part → camera. weight: (..., n) trust, non-negative, some positive.
-        symmetry: the part's proper group. width: angle at which a hypothesis no longer counts, radians.
+        R: (..., n, 3, 3) hypotheses in no particular order, part → camera.
+        weight: (..., n) trust, non-negative, some positive. symmetry: the part's proper group.
+        width: angle at which a hypothesis no longer counts, radians.
     Returns:
         (..., 3, 3).
     Note:
         For a revolution the turn about the axis is arbitrary, for a sphere the whole rotation.
     """
     starts = _starts(R, weight)
-    support = (weight[..., None, :] * _nearness(R, starts, symmetry, 2 * width)[1]).sum(-1)
+    some, trust = R[..., :SUPPORTERS, :, :], weight[..., None, :SUPPORTERS]
+    support = (trust * _nearness(some, starts, symmetry, 2 * width)[1]).sum(-1)
     best = support.argmax(-1)[..., None, None, None].expand(*support.shape[:-1], 1, 3, 3)
     mean = starts.gather(-3, best)
     for shrink in torch.linspace(2.0, 1.0, ROUNDS).tolist():

@@ -14,8 +14,10 @@ from torch import Tensor
 
 from pnet.geometry.pose_space import PoseSpace
 from pnet.geometry.symmetry import FiniteSymmetry, Symmetry
-from pnet.parts.keypoints import Keypoint, KeypointChain
-from pnet.parts.solids import Shape, Solid, solid
+from pnet.parts.keypoints import KeypointChain
+from pnet.parts.selection import Keypoint
+from pnet.parts.shapes import Shape
+from pnet.parts.solids import Solid, solid
 
 Points = NDArray[np.float64]
 Grid = Mapping[str, Sequence[float]]
@@ -84,7 +86,7 @@ class ParametricPart(ABC):
 
     @abstractmethod
     def solid(self, parameters: Points) -> Solid | Shape:
-        """The solid in the frame of construction, out of `pnet.parts.solids`.
+        """The solid in the frame of construction, out of `pnet.parts.shapes` and `pnet.parts.solids`.
 
         Args:
             parameters: (..., k) metres. Write it with broadcasting in mind: unpack with

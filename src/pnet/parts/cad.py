@@ -19,10 +19,10 @@ from scipy.spatial import ConvexHull
 
 from pnet.geometry.symmetry import RevolutionSymmetry, SphericalSymmetry, Symmetry
 from pnet.parts.base import ParametricPart
-from pnet.parts.declared import Fields, check_kind, keypoint_from, mirror_from, symmetry_from
-from pnet.parts.keypoints import Keypoint
+from pnet.parts.declared_fields import Fields, check_kind, keypoint_from, mirror_from, symmetry_from
 from pnet.parts.primitives import Circle, Corner, Plane, Sphere
-from pnet.parts.solids import Shape
+from pnet.parts.selection import Keypoint
+from pnet.parts.shapes import Shape
 
 Points = NDArray[np.float64]
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}

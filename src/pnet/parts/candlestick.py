@@ -6,8 +6,8 @@ published; the values are ours.
 
 from pnet.geometry.symmetry import RevolutionSymmetry
 from pnet.parts.base import ParametricPart, Points
-from pnet.parts.keypoints import Keypoint
 from pnet.parts.primitives import Circle, Plane
+from pnet.parts.selection import Keypoint
 from pnet.parts.solids import Solid, cylinder
 
 FOOT = 0.12  # foot height / total height

@@ -15,7 +15,7 @@ from pnet.geometry.rigid import apply_pose
 from pnet.geometry.symmetry import RevolutionSymmetry, SphericalSymmetry, nearest_equivalent
 from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointChoice
-from pnet.parts.solids import manifold
+from pnet.parts.shapes import manifold
 
 Points = NDArray[np.float64]
 ROUND_TRIP = 1e-9  # metres, largest error of parameters out of exact keypoints

@@ -14,7 +14,8 @@ from pnet.parts.expressions import check_expression
 from pnet.parts.primitives import Corner, Freedom, Plane, Polygon
 
 if TYPE_CHECKING:
-    from pnet.parts.keypoints import Keypoint, KeypointChain
+    from pnet.parts.keypoints import KeypointChain
+    from pnet.parts.selection import Keypoint
 
 
 def check_names(keypoints: Sequence[Keypoint], parameters: Sequence[str]) -> None:

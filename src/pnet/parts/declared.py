@@ -6,44 +6,27 @@ millimetres.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from pnet.geometry.symmetry import (
-    FiniteSymmetry,
-    RevolutionSymmetry,
-    SphericalSymmetry,
-    Symmetry,
-    cyclic,
-    dihedral,
-    reflection,
-)
 from pnet.parts.base import Grid, ParametricPart
-from pnet.parts.expressions import Expression, check_condition, check_expression, holds, length
-from pnet.parts.keypoints import Keypoint
-from pnet.parts.primitives import Circle, Corner, Cylinder, Direction, Plane, Polygon, Primitive, Sphere, unit
-from pnet.parts.solids import (
-    Ball,
-    Extrusion,
-    Operation,
-    Revolution,
-    Shape,
-    Solid,
-    box,
-    cone,
-    cylinder,
-    moved,
-    outline,
-    polygon,
+from pnet.parts.declared_fields import (
+    Fields,
+    check_kind,
+    check_shape,
+    closest,
+    keypoint_from,
+    mirror_from,
+    symmetry_from,
 )
+from pnet.parts.expressions import Expression, check_condition, check_expression, holds, length
+from pnet.parts.shapes import Ball, Extrusion, Revolution, Shape, polygon
+from pnet.parts.solids import Operation, Solid, box, cone, cylinder, moved, outline
 
 Points = NDArray[np.float64]
-Fields = Mapping[str, Any]
 Length = Callable[[Expression], Points]  # an expression's value for the parameters at hand, metres
 
 
@@ -115,13 +98,6 @@ class DeclaredPart(ParametricPart):
         return Solid(tuple((step.operation, step.shape(value)) for step in self._steps))
 
 
-def check_kind(kind: type, words: str, **fields: Any) -> None:
-    """Raise ValueError that names the first field of another kind; a text counts as no list."""
-    for key, value in fields.items():
-        if isinstance(value, str) or not isinstance(value, kind):
-            raise ValueError(f"{key} is {value!r}, expected {words}")
-
-
 def _named(where: str, check: Callable[[Any, Sequence[str]], None], text: Any, names: Sequence[str]) -> None:
     """A check whose error names where the text stands."""
     try:
@@ -143,7 +119,7 @@ class _Step:
             raise ValueError(f"{where}: the first step must add something")
         if kind not in SHAPES:
             raise ValueError(
-                f"{where}: no shape {kind!r}{_closest(str(kind), SHAPES)}; there are {', '.join(SHAPES)}"
+                f"{where}: no shape {kind!r}{closest(str(kind), SHAPES)}; there are {', '.join(SHAPES)}"
             )
         self._build, wanted = SHAPES[kind]
         given = {key: value for key, value in fields.items() if key != operations[0]}
@@ -155,9 +131,9 @@ class _Step:
             )
         if self._axis not in ("x", "y", "z"):
             raise ValueError(f"{where}: axis is {self._axis!r}, choose x, y or z")
-        _check_shape(f"{where}.at", (3,), self._at)
+        check_shape(f"{where}.at", (3,), self._at)
         for key, form in wanted.items():
-            _check_shape(f"{where}.{key}", form, given[key])
+            check_shape(f"{where}.{key}", form, given[key])
         self._fields = given
 
     def expressions(self) -> list[Expression]:
@@ -167,27 +143,6 @@ class _Step:
     def shape(self, value: Length) -> Shape:
         """The placed shape for the parameters behind `value`."""
         return moved(self._build(value, **self._fields), self._axis, tuple(value(x) for x in self._at))
-
-
-def _check_shape(where: str, form: tuple[int, ...] | str, value: Any) -> None:
-    """A field holds one expression (), several (n,), points (−1, 2) or a whole number "sides"."""
-    if form == "sides":
-        if not isinstance(value, int) or isinstance(value, bool) or value < 3:
-            raise ValueError(f"{where} is {value!r}, expected a whole number of at least 3")
-        return
-    assert not isinstance(form, str)
-    if not form:
-        if isinstance(value, bool) or not isinstance(value, (str, int, float)):
-            raise ValueError(f"{where} is {value!r}, expected a number or an expression in mm")
-        return
-    count, least = form[0], 3
-    is_list = isinstance(value, Sequence) and not isinstance(value, str)
-    if not is_list or (len(value) < least if count == -1 else len(value) != count):
-        raise ValueError(
-            f"{where} is {value!r}, expected a list of {count if count > 0 else f'at least {least}'}"
-        )
-    for i, item in enumerate(value):
-        _check_shape(f"{where}[{i}]", form[1:], item)
 
 
 def _leaves(value: Any) -> Iterator[Expression]:
@@ -235,7 +190,6 @@ def _corners(value: Length, corners: Sequence[Sequence[Expression]]) -> Points:
     return outline([(value(x), value(y)) for x, y in corners])
 
 
-MOST_TURNS = 48  # beyond it a part is a revolution for any camera
 # shape → how it is built, and its fields: () one length, (2,) from and to, (−1, 2) corners
 SHAPES: dict[str, tuple[Callable[..., Shape], dict[str, tuple[int, ...] | str]]] = {
     "cylinder": (_cylinder, {"radius": (), "low": (), "high": ()}),
@@ -246,107 +200,3 @@ SHAPES: dict[str, tuple[Callable[..., Shape], dict[str, tuple[int, ...] | str]]]
     "revolution": (_revolution, {"profile": (-1, 2)}),
     "sphere": (_sphere, {"radius": ()}),
 }
-# primitive → fields that it takes beside from, measures, factor
-PRIMITIVES = {
-    "plane": {"at"},
-    "cylinder": {"towards"},
-    "circle": {"towards"},
-    "sphere": set[str](),
-    "polygon": {"towards", "sides"},
-    "corner": set[str](),
-}
-
-
-def keypoint_from(name: str, fields: Fields) -> Keypoint:
-    """A keypoint out of its fields; see `DeclaredPart`."""
-    where = f"keypoints.{name}"
-    kinds = [key for key in fields if key in PRIMITIVES] if isinstance(fields, Mapping) else []
-    if len(kinds) != 1:
-        hints = (_closest(str(word), PRIMITIVES) for word in set(fields) - {"from", "measures", "factor"})
-        raise ValueError(
-            f"{where} is {fields}, expected exactly one of {', '.join(PRIMITIVES)}"
-            f"{next(filter(None, hints), '')}"
-        )
-    kind = kinds[0]
-    known = {kind, "from", "measures", "factor", *PRIMITIVES[kind]}
-    for word in set(fields) - known:
-        raise ValueError(f"{where}: a {kind} takes no field {word!r}{_closest(word, sorted(known))}")
-    if not isinstance(fields.get("from"), str):
-        raise ValueError(f"{where}: say with from: where its distance starts (centroid or another keypoint)")
-    factor = fields.get("factor", 1.0)
-    if isinstance(factor, bool) or not isinstance(factor, int | float):
-        raise ValueError(f"{where}: factor is {factor!r}, expected a number")
-    primitive = _primitive(where, kind, fields)
-    return Keypoint(name, fields["from"], primitive, fields.get("measures"), float(factor))
-
-
-def _primitive(where: str, kind: str, fields: Fields) -> Primitive:
-    if kind == "corner":
-        _check_shape(f"{where}.corner", (3,), fields[kind])
-        x, y, z = fields[kind]
-        return Corner((x, y, z))
-    if kind == "sphere":
-        return Sphere()
-    direction = _direction(f"{where}.{kind}", fields[kind])
-    towards = None if fields.get("towards") is None else _direction(f"{where}.towards", fields["towards"])
-    try:
-        match kind:
-            case "plane":
-                if fields.get("at") is not None:
-                    _check_shape(f"{where}.at", (), fields["at"])
-                primitive: Primitive = Plane(direction, fields.get("at"))
-            case "cylinder":
-                primitive = Cylinder(direction, towards)
-            case "circle":
-                primitive = Circle(direction, towards)
-            case _:
-                _check_shape(f"{where}.sides", "sides", fields.get("sides"))
-                primitive = Polygon(fields["sides"], direction, towards)
-        primitive.direction  # noqa: B018  refuses what is no direction
-    except ValueError as fault:
-        raise ValueError(f"{where}: {str(fault).removeprefix(f'{where}: ')}") from fault
-    return primitive
-
-
-def _direction(where: str, value: Any) -> Direction:
-    if isinstance(value, str):
-        return value
-    if isinstance(value, Sequence) and len(value) == 3 and all(isinstance(x, int | float) for x in value):
-        x, y, z = (float(x) for x in value)
-        return x, y, z
-    raise ValueError(f"{where} is {value!r}, expected x, y, z, -x, -y, -z or three numbers")
-
-
-def symmetry_from(value: str | Fields) -> Symmetry:
-    """A symmetry group out of its name; see `DeclaredPart`."""
-    named: dict[str, Symmetry] = {
-        "none": cyclic(1),
-        "revolution": RevolutionSymmetry(),
-        "revolution_equal_ends": RevolutionSymmetry(rotoreflection=True),
-        "sphere": SphericalSymmetry(),
-    }
-    choices = [*named, "{cyclic: n}", "{dihedral: n}" + f" (n up to {MOST_TURNS})", "{rotations: [matrices]}"]
-    if isinstance(value, str) and value in named:
-        return named[value]
-    match value:
-        case {"cyclic": int(n), **others} if 1 <= n <= MOST_TURNS and not others:
-            return cyclic(n)
-        case {"dihedral": int(n), **others} if 1 <= n <= MOST_TURNS and not others:
-            return dihedral(n)
-        case {"rotations": rotations, **others} if not others:
-            try:
-                matrices = torch.tensor(rotations, dtype=torch.float64)
-            except (TypeError, ValueError) as fault:
-                raise ValueError(f"symmetry.rotations is no list of 3 × 3 matrices ({fault})") from fault
-            return FiniteSymmetry(matrices)
-    raise ValueError(f"symmetry is {value!r}, choose {', '.join(choices)}")
-
-
-def mirror_from(normal: str | None) -> torch.Tensor | None:
-    """The reflection in the plane with this normal."""
-    return None if normal is None else reflection(tuple(unit(_direction("mirror", normal)).tolist()))
-
-
-def _closest(word: str, known: Sequence[str] | Mapping[str, Any]) -> str:
-    found = difflib.get_close_matches(word, list(known), n=1)
-    return f", did you mean {found[0]}?" if found else ""

@@ -6,8 +6,8 @@ wheel's. Diameter and height are about those of the data set's object (114 and 6
 
 from pnet.geometry.symmetry import RevolutionSymmetry
 from pnet.parts.base import ParametricPart, Points
-from pnet.parts.keypoints import Keypoint
 from pnet.parts.primitives import Circle, Plane
+from pnet.parts.selection import Keypoint
 from pnet.parts.solids import Solid, cylinder
 
 WHEEL = 0.4  # wheel height / total height

@@ -8,8 +8,8 @@ import numpy as np
 
 from pnet.geometry.symmetry import cyclic, reflection
 from pnet.parts.base import ParametricPart, Points
-from pnet.parts.keypoints import Keypoint
 from pnet.parts.primitives import Circle, Plane
+from pnet.parts.selection import Keypoint
 from pnet.parts.solids import Solid, box, cylinder
 
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from pnet.geometry.symmetry import cyclic, reflection
 from pnet.parts.base import ParametricPart, Points
-from pnet.parts.keypoints import Keypoint
 from pnet.parts.primitives import Plane
+from pnet.parts.selection import Keypoint
 from pnet.parts.solids import Solid, box
 
 

@@ -4,9 +4,10 @@ import numpy as np
 
 from pnet.geometry.symmetry import dihedral
 from pnet.parts.base import ParametricPart, Points
-from pnet.parts.keypoints import Keypoint
 from pnet.parts.primitives import Circle, Plane, Polygon
-from pnet.parts.solids import Solid, cylinder, hole, polygon, prism
+from pnet.parts.selection import Keypoint
+from pnet.parts.shapes import polygon
+from pnet.parts.solids import Solid, cylinder, hole, prism
 
 
 class TN06(ParametricPart):

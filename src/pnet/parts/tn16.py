@@ -5,8 +5,8 @@ The publication shows only a picture; the sizes are ours.
 
 from pnet.geometry.symmetry import RevolutionSymmetry
 from pnet.parts.base import ParametricPart, Points
-from pnet.parts.keypoints import Keypoint, cone_keypoints
 from pnet.parts.primitives import Plane
+from pnet.parts.selection import Keypoint, cone_keypoints
 from pnet.parts.solids import Solid, cone, cylinder
 
 

@@ -5,8 +5,8 @@ The publication shows only a picture; the proportions and sizes are ours.
 
 from pnet.geometry.symmetry import RevolutionSymmetry
 from pnet.parts.base import ParametricPart, Points
-from pnet.parts.keypoints import Keypoint
 from pnet.parts.primitives import Circle, Plane
+from pnet.parts.selection import Keypoint
 from pnet.parts.solids import Solid, cylinder, hole
 
 DISC = 0.3  # disc height / total height

@@ -5,9 +5,10 @@ The publication shows only a picture; the sizes are ours.
 
 from pnet.geometry.symmetry import cyclic, reflection
 from pnet.parts.base import ParametricPart, Points
-from pnet.parts.keypoints import Keypoint
 from pnet.parts.primitives import Corner, Plane
-from pnet.parts.solids import Shape, moved, outline, prism
+from pnet.parts.selection import Keypoint
+from pnet.parts.shapes import Shape
+from pnet.parts.solids import moved, outline, prism
 
 SMALL_END = 0.006  # height of the small end, metres
 

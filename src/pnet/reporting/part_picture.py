@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pnet.geometry.symmetry import FiniteSymmetry, RevolutionSymmetry
 from pnet.parts.base import ParametricPart
-from pnet.parts.keypoints import CENTROID, Keypoint
+from pnet.parts.selection import CENTROID, Keypoint
 from pnet.reporting.part_labels import DOT, HALO, write_labels
 from pnet.reporting.part_view import (
     PANEL,

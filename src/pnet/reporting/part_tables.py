@@ -9,8 +9,8 @@ from rich.table import Table
 from pnet.geometry.symmetry import FiniteSymmetry, RevolutionSymmetry, Symmetry
 from pnet.parts.base import ParametricPart
 from pnet.parts.checks import Check
-from pnet.parts.keypoints import Keypoint
 from pnet.parts.primitives import Freedom
+from pnet.parts.selection import Keypoint
 
 Points = NDArray[np.float64]
 
