@@ -85,3 +85,16 @@ def test_no_valid_size_between_the_grids_ends_is_said():
 
     with pytest.raises(ValueError, match="tn42: no valid parameters between the grids' ends"):
         random_instances(Never(GRID), 10, seed=0)
+
+
+def test_a_rotation_symmetry_that_is_not_declared_is_pointed_out():
+    class Plain(TN42):
+        symmetry = cyclic(1)
+
+        def solid(self, parameters):
+            length, a, w = self.split(parameters)
+            return box((0, length), (-w / 2, w / 2), (0, a))
+
+    notes = [check for check in check_part(Plain(GRID), samples=5) if check.is_advice]
+    assert [check.passed for check in notes] == [False]
+    assert notes[0].detail == "1/2 turn about x, 1/2 turn about y, 1/2 turn about z also fits"

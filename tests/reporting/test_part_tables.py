@@ -101,3 +101,9 @@ def test_a_failed_check_is_marked():
         ["│", "ok", "│", "one", "│", "0", "mm", "│"],
         ["│", "FAILED", "│", "other", "│", "9", "mm", "│"],
     ]
+
+
+def test_advice_is_no_failure():
+    checks = [Check("a", True, "1"), Check("b", False, "2", is_advice=True), Check("c", False, "3")]
+    column = list(check_table(checks).columns[0].cells)
+    assert column == ["[green]ok[/]", "[yellow]note[/]", "[bold red]FAILED[/]"]

@@ -28,11 +28,13 @@ class Check:
 
     Attributes:
         name: what must hold. passed: whether it does. detail: the figure.
+        is_advice: it may be meant so, and is no fault of the declaration.
     """
 
     name: str
     passed: bool
     detail: str
+    is_advice: bool = False
 
 
 def check_part(part: ParametricPart, samples: int, seed: int = 0) -> Iterator[Check]:
@@ -119,7 +121,10 @@ def _symmetry_check(part: ParametricPart, meshes: list[trimesh.Trimesh]) -> Chec
 
 
 def _missing_symmetry_check(part: ParametricPart, meshes: list[trimesh.Trimesh]) -> Check:
-    """A turn that carries every size's solid onto itself must be declared: else labels are ambiguous."""
+    """A turn that carries every size's solid onto itself should be declared: else labels are ambiguous.
+
+    It is advice: a solid may stand for a body that is less symmetric than itself.
+    """
     name, found = "no rotation symmetry is missing", []
     for axis in "xyz":
         for fraction in (2, 3, 4, 5, 6):
@@ -128,7 +133,8 @@ def _missing_symmetry_check(part: ParametricPart, meshes: list[trimesh.Trimesh])
             declared = bool((nearest - torch.from_numpy(turn)).abs().max() < 1e-6)
             if not declared and all(_left_over(mesh, turn) < 1e-6 for mesh in meshes):
                 found.append(f"1/{fraction} turn about {axis}")
-    return Check(name, not found, ", ".join(found) + " is one" if found else "turns about x, y, z tried")
+    detail = f"{', '.join(found)} also fits" if found else "turns about x, y, z tried"
+    return Check(name, not found, detail, is_advice=True)
 
 
 def _left_over(mesh: trimesh.Trimesh, element: Points) -> float:

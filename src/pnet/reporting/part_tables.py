@@ -61,7 +61,8 @@ def check_table(checks: Sequence[Check]) -> Table:
     """What was checked, and what came out."""
     table = _table("checks", "", "statement", "figure")
     for check in checks:
-        table.add_row("[green]ok[/]" if check.passed else "[bold red]FAILED[/]", check.name, check.detail)
+        failed = "[yellow]note[/]" if check.is_advice else "[bold red]FAILED[/]"
+        table.add_row("[green]ok[/]" if check.passed else failed, check.name, check.detail)
     return table
 
 
