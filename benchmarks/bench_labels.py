@@ -49,7 +49,7 @@ def times(part: ParametricPart) -> list[float]:
     sizes, R, t = random_instances(part, INSTANCES, seed=1)
     owner = torch.arange(POINTS) % INSTANCES
     points = surface_points(part, sizes, owner)
-    template = part.chain.canonical(sizes)
+    template = part.chain.keypoints_from_parameters(sizes)
     local, _ = part.chain.choose(NearestToPoint(points), template[owner])
     votes = PointVotes(
         t[owner],
@@ -62,7 +62,11 @@ def times(part: ParametricPart) -> list[float]:
         clock(lambda: part.chain.select(choice, sizes, R)),
         clock(lambda: part.chain.select(choice, many_sizes, many_R)) / SCENES,
         clock(lambda: [part.chain.select(choice, s, r) for s, r in zip(sizes, R, strict=True)]),
-        clock(lambda: part.chain.choose(NearestToPoint(points), part.chain.canonical(sizes)[owner])),
+        clock(
+            lambda: part.chain.choose(
+                NearestToPoint(points), part.chain.keypoints_from_parameters(sizes)[owner]
+            )
+        ),
         clock(lambda: MeanVote()(part, votes)),
         clock(lambda: FOLDED(part, votes)),
     ]
@@ -72,7 +76,7 @@ def surface_points(part: ParametricPart, sizes: torch.Tensor, owner: torch.Tenso
     """(N, 3) points on the smallest part object's surface, scaled to each instance's reach, part frame."""
     mesh = part.mesh(part.part_object("L", 0))
     sample = torch.from_numpy(np.asarray(mesh.sample(len(owner), seed=0)))
-    reach = torch.linalg.vector_norm(part.chain.canonical(sizes), dim=-1).amax(-1)
+    reach = torch.linalg.vector_norm(part.chain.keypoints_from_parameters(sizes), dim=-1).amax(-1)
     return sample * (reach / reach.min())[owner, None]
 
 

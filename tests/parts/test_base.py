@@ -103,7 +103,9 @@ def test_the_symmetry_carries_the_solid_onto_itself(part):
 def test_every_half_turn_and_mirror_of_the_solid_is_declared(part):
     """A mirror may also do to the finite keypoints what a declared element does: then it adds nothing."""
     mesh = part.mesh(part.part_object("L", 0)).apply_scale(1000)
-    template = part.chain.canonical(torch.from_numpy(part.part_object("L", 0)))[part.chain.is_finite]
+    template = part.chain.keypoints_from_parameters(torch.from_numpy(part.part_object("L", 0)))[
+        part.chain.is_finite
+    ]
     for signs in ((1, -1, -1), (-1, 1, -1), (-1, -1, 1), (-1, 1, 1), (1, -1, 1), (1, 1, -1)):
         moved = mesh.copy().apply_transform(np.diag([*signs, 1.0]))
         fits = common_volume(mesh, moved) > 0.999 * mesh.volume
@@ -118,7 +120,9 @@ def test_every_half_turn_and_mirror_of_the_solid_is_declared(part):
 def test_parameters_come_back_from_the_labels_of_every_part_object(part, rotations):
     for grid in part.grids.values():
         parameters, R = torch.from_numpy(grid), rotations(len(grid))
-        labels, margin = part.chain.choose(NearestToCamera(R), part.chain.canonical(parameters))
+        labels, margin = part.chain.choose(
+            NearestToCamera(R), part.chain.keypoints_from_parameters(parameters)
+        )
         found = part.chain.parameters_from_keypoints(torch.zeros(len(grid), 3).double(), labels)
         torch.testing.assert_close(found, parameters, atol=1e-12, rtol=0)
         assert (margin >= 0).all()
@@ -126,7 +130,7 @@ def test_parameters_come_back_from_the_labels_of_every_part_object(part, rotatio
 
 def test_keypoints_lie_in_the_solids_bounds(part):
     for parameters in some_objects(part):
-        keypoints = part.chain.canonical(torch.from_numpy(parameters)).numpy()
+        keypoints = part.chain.keypoints_from_parameters(torch.from_numpy(parameters)).numpy()
         low, high = part.mesh(parameters).bounds
         assert (keypoints > low - 1e-9).all() and (keypoints < high + 1e-9).all()
 

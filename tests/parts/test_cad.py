@@ -37,7 +37,7 @@ def test_a_cuboids_sizes_are_its_parameters(meshes, rotations):
     mesh = part.mesh(size)
     assert 1e9 * mesh.volume == pytest.approx(24_000, rel=1e-6)
     assert np.abs(mesh.center_mass).max() < 1e-9
-    corner, *ends = part.chain.canonical(torch.from_numpy(size))
+    corner, *ends = part.chain.keypoints_from_parameters(torch.from_numpy(size))
     torch.testing.assert_close(corner, torch.tensor([-0.010, -0.015, -0.020]).double(), atol=1e-7, rtol=0)
     for axis, end in enumerate(ends):
         expected = [-0.010, -0.015, -0.020]
@@ -49,7 +49,7 @@ def test_a_turned_cylinders_sizes_are_its_parameters(meshes):
     part = CadPart("rod", str(meshes / "rod.ply"), bounds="cylinder", symmetry="revolution")
     sizes = dict(zip(part.parameter_names, part.part_object("L", 0).tolist(), strict=True))
     assert sizes == pytest.approx({"h": 0.030, "r": 0.010}, rel=1e-5)
-    base, top, rim = part.chain.canonical(torch.from_numpy(part.part_object("L", 0)))
+    base, top, rim = part.chain.keypoints_from_parameters(torch.from_numpy(part.part_object("L", 0)))
     assert base.tolist() == pytest.approx([0, 0, -0.015], abs=1e-7)
     assert top.tolist() == pytest.approx([0, 0, 0.015], abs=1e-7)
     assert math.hypot(*rim[:2].tolist()) == pytest.approx(0.010, rel=1e-5) and rim[2] == base[2]
@@ -79,7 +79,7 @@ def test_keypoints_of_ones_own(meshes):
     path = str(meshes / "cuboid.stl")
     part = CadPart("own", path, symmetry={"cyclic": 2}, keypoints=keypoints, sizes={"h": 40, "l": 20})
     assert part.part_object("L", 0).tolist() == [0.040, 0.020]
-    floor, top, side = part.chain.canonical(torch.from_numpy(part.part_object("L", 0)))
+    floor, top, side = part.chain.keypoints_from_parameters(torch.from_numpy(part.part_object("L", 0)))
     assert floor.tolist() == pytest.approx([0, 0, -0.020], abs=1e-7)
     assert top.tolist() == pytest.approx([0, 0, 0.020], abs=1e-7)
     assert side.tolist() == pytest.approx([0.010, 0, -0.020], abs=1e-7)

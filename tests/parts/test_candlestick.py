@@ -24,12 +24,14 @@ def test_volume_and_centroid_are_those_of_foot_stem_and_cup(part):
     assert part.mesh(SIZE).volume == pytest.approx(volumes.sum(), rel=1e-9)
     height = volumes @ (ends[:-1] + ends[1:]) / 2 / volumes.sum()
     np.testing.assert_allclose(part.centroid(SIZE[None])[0], [0, 0, height], atol=1e-9)
-    base, top, *_ = part.chain.canonical(torch.from_numpy(SIZE))
+    base, top, *_ = part.chain.keypoints_from_parameters(torch.from_numpy(SIZE))
     assert (base[2].item(), top[2].item()) == pytest.approx((-height, h - height))
 
 
 def test_rim_and_cup_lie_on_the_end_circles(part):
-    keypoints = dict(zip(part.chain.names, part.chain.canonical(torch.from_numpy(SIZE)), strict=True))
+    keypoints = dict(
+        zip(part.chain.names, part.chain.keypoints_from_parameters(torch.from_numpy(SIZE)), strict=True)
+    )
     low, high = part.mesh(SIZE).bounds[:, 2]
     assert keypoints["rim"].tolist() == pytest.approx([0.030, 0, low])
     assert keypoints["cup"].tolist() == pytest.approx([0.016, 0, high])

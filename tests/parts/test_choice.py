@@ -71,14 +71,14 @@ def check_against_brute_force(chain, template: Tensor, found: Tensor, margin: Te
 
 
 def test_the_camera_rule_is_the_minimum_over_all_equivalents(chain, rotations, sizes):
-    R, template = rotations(12), chain.canonical(sizes(chain, 12))
+    R, template = rotations(12), chain.keypoints_from_parameters(sizes(chain, 12))
     found, margin = chain.choose(NearestToCamera(R), template)
     for n in range(12):
         check_against_brute_force(chain, template[n], found[n], margin[n], lambda p, n=n: p @ R[n, 2])
 
 
 def test_the_point_rule_is_the_minimum_over_all_equivalents(chain, sizes):
-    template = chain.canonical(sizes(chain, 12))
+    template = chain.keypoints_from_parameters(sizes(chain, 12))
     points = 0.02 * torch.randn(12, 3, generator=torch.Generator().manual_seed(5)).double()
     found, margin = chain.choose(NearestToPoint(points), template)
     for n in range(12):
@@ -88,7 +88,7 @@ def test_the_point_rule_is_the_minimum_over_all_equivalents(chain, sizes):
 
 
 def test_the_camera_labels_are_the_same_for_every_equivalent_pose(chain, rotations, sizes, symmetries):
-    R, template = rotations(20), chain.canonical(sizes(chain, 20))
+    R, template = rotations(20), chain.keypoints_from_parameters(sizes(chain, 20))
     labels, margin = chain.choose(NearestToCamera(R), template)
     for g in symmetries(chain):
         turned, other = chain.choose(NearestToCamera(R @ g), template)
@@ -97,7 +97,7 @@ def test_the_camera_labels_are_the_same_for_every_equivalent_pose(chain, rotatio
 
 
 def test_the_point_labels_turn_with_the_point(chain, sizes, symmetries):
-    template = chain.canonical(sizes(chain, 20))
+    template = chain.keypoints_from_parameters(sizes(chain, 20))
     points = 0.02 * torch.randn(20, 3, generator=torch.Generator().manual_seed(6)).double()
     labels, margin = chain.choose(NearestToPoint(points), template)
     for g in symmetries(chain):
@@ -109,7 +109,7 @@ def test_the_point_labels_turn_with_the_point(chain, sizes, symmetries):
 def test_hole_and_vertex_stay_on_the_chosen_face(declare, rotations, sizes):
     chain = declare("nut")
     R, parameters = rotations(100), sizes(chain, 100)
-    found, _ = chain.choose(NearestToCamera(R), chain.canonical(parameters))
+    found, _ = chain.choose(NearestToCamera(R), chain.keypoints_from_parameters(parameters))
     heights = found[..., 2]
     torch.testing.assert_close(heights, heights[:, :1].expand(-1, 3), atol=1e-15, rtol=0)
     assert torch.equal(heights[:, 0] > 0, R[:, 2, 2] < 0)
@@ -121,7 +121,7 @@ def test_the_vertex_is_one_of_the_chosen_faces_own_three(declare, rotations, siz
     """Upper vertices at 90°, 210°, 330°; lower ones turned by 60°."""
     chain = declare(body)
     R, parameters = rotations(100), sizes(chain, 100)
-    found, _ = chain.choose(NearestToCamera(R), chain.canonical(parameters))
+    found, _ = chain.choose(NearestToCamera(R), chain.keypoints_from_parameters(parameters))
     face, vertex = (found[:, chain.names.index(name)] for name in ("face", "vertex"))
     degrees = torch.atan2(vertex[:, 1], vertex[:, 0]).rad2deg().round().long() % 360
     up = R[:, 2, 2] < 0
@@ -133,7 +133,7 @@ def test_the_pipe_chosen_first_binds_its_end(declare, rotations, sizes):
     """The end must close the pipe that was chosen, though the other pipe's may be nearer."""
     chain = declare("crossed pipes")
     R, parameters = rotations(200), sizes(chain, 200)
-    found, _ = chain.choose(NearestToCamera(R), chain.canonical(parameters))
+    found, _ = chain.choose(NearestToCamera(R), chain.keypoints_from_parameters(parameters))
     assert (found[:, 0] * found[:, 1]).sum(-1).abs().max() < 1e-15
     other_nearer = R[:, 2, :2].abs().argmax(-1) != found[:, 1, :2].abs().argmax(-1)
     assert other_nearer.any()
@@ -142,7 +142,7 @@ def test_the_pipe_chosen_first_binds_its_end(declare, rotations, sizes):
 def test_seen_along_its_axis_a_hexagon_goes_by_y_then_x(declare):
     """All vertices are equally near; camera y is ∓y, two vertices tie in it, the smaller x has it."""
     chain = declare("nut")
-    template = chain.canonical(metres(0.004, 0.010, 0.012))
+    template = chain.keypoints_from_parameters(metres(0.004, 0.010, 0.012))
     high = 0.012 * math.sqrt(0.75)
     for view, y in ((DOWN, high), (EYE, -high)):
         found, margin = chain.choose(NearestToCamera(view), template)
@@ -162,7 +162,9 @@ def test_equal_faces_seen_from_the_side_are_told_apart_by_y_then_x(declare, axis
     x = z.roll(1)
     view = torch.stack([x, torch.linalg.cross(z, x), z], -1)
     assert torch.linalg.det(view) == 1
-    found, margin = chain.choose(NearestToCamera(view), chain.canonical(metres(0.01, 0.02, 0.005)))
+    found, margin = chain.choose(
+        NearestToCamera(view), chain.keypoints_from_parameters(metres(0.01, 0.02, 0.005))
+    )
     assert found[0].tolist() == pytest.approx([0, 0, 0.01 * side])
     assert found[2].tolist() == pytest.approx([0, 0, 0.015 * side])
     assert float(margin[0]) == pytest.approx(0.02 if axis_in_camera[2] else 0)
@@ -170,7 +172,7 @@ def test_equal_faces_seen_from_the_side_are_told_apart_by_y_then_x(declare, axis
 
 def test_a_point_on_the_axis_takes_the_templates_own_place_on_the_circle(declare):
     chain = declare("flange")
-    template = chain.canonical(metres(0.01, 0.02))
+    template = chain.keypoints_from_parameters(metres(0.01, 0.02))
     found, margin = chain.choose(NearestToPoint(metres(0, 0, 0.03)), template)
     torch.testing.assert_close(found, template)
     assert margin.tolist() == [math.inf, 0]
@@ -181,7 +183,7 @@ def test_a_point_on_the_axis_takes_the_templates_own_place_on_the_circle(declare
 def test_the_nearest_point_of_a_circle_has_the_points_azimuth(declare, azimuth, radius, height):
     chain = declare("flange")
     point = metres(radius * math.cos(azimuth), radius * math.sin(azimuth), height)
-    found, margin = chain.choose(NearestToPoint(point), chain.canonical(metres(0.01, 0.02)))
+    found, margin = chain.choose(NearestToPoint(point), chain.keypoints_from_parameters(metres(0.01, 0.02)))
     expected = [0.01 * math.cos(azimuth), 0.01 * math.sin(azimuth), -0.02]
     assert found[1].tolist() == pytest.approx(expected, abs=1e-12)
     near, far = (math.hypot(radius - s * 0.01, height + 0.02) for s in (1, -1))
@@ -225,7 +227,9 @@ def test_an_oblique_choice_is_the_camera_rule_in_a_turned_camera(declare, rotati
     chain, choice = declare("nut"), KeypointChoice(direction=(0.6, 0.0, 0.8))
     R, parameters = rotations(20), sizes(chain, 20)
     found, margin = chain.select(choice, parameters, R)
-    expected, lead = chain.choose(NearestToCamera(choice.frame @ R), chain.canonical(parameters))
+    expected, lead = chain.choose(
+        NearestToCamera(choice.frame @ R), chain.keypoints_from_parameters(parameters)
+    )
     assert torch.equal(found, expected) and torch.equal(margin, lead)
     along = (found @ R.mT) @ metres(0.6, 0.0, 0.8)
     for g in chain.group:
@@ -247,5 +251,5 @@ def test_a_keypoint_bound_by_anothers_choice_is_no_surer_than_that():
     keypoints = [Keypoint("end", "centroid", Plane("x"), "l"), Keypoint("side", "centroid", Plane("y"), "w")]
     chain = KeypointChain(keypoints, ["l", "w"], cyclic(2))
     tilt = torch.tensor([[1, 0, 1e-4], [0, 1, 0], [-1e-4, 0, 1]], dtype=torch.float64)
-    _, margin = chain.choose(NearestToCamera(tilt), chain.canonical(metres(0.02, 0.03)))
+    _, margin = chain.choose(NearestToCamera(tilt), chain.keypoints_from_parameters(metres(0.02, 0.03)))
     assert margin.tolist() == pytest.approx([4e-6, 4e-6], rel=1e-6)

@@ -39,7 +39,7 @@ def test_parameters_come_back_from_the_labels_in_any_pose(chain, choice, rotatio
 
 def test_parameters_come_back_from_the_labels_nearest_to_a_point(chain, sizes):
     parameters = sizes(chain, 50)
-    labels, _ = chain.choose(NearestToPoint(random_points(50)), chain.canonical(parameters))
+    labels, _ = chain.choose(NearestToPoint(random_points(50)), chain.keypoints_from_parameters(parameters))
     found = chain.parameters_from_keypoints(torch.zeros(50, 3).double(), labels)
     torch.testing.assert_close(found, parameters, atol=1e-12, rtol=0)
 
@@ -50,7 +50,9 @@ def test_any_positive_parameters_come_back(declare, values):
     parameters = torch.tensor(values, dtype=torch.float64)
     for name in ("nut", "wedge", "double cone", "lug"):
         chain = declare(name)
-        found = chain.parameters_from_keypoints(torch.zeros(3).double(), chain.canonical(parameters))
+        found = chain.parameters_from_keypoints(
+            torch.zeros(3).double(), chain.keypoints_from_parameters(parameters)
+        )
         torch.testing.assert_close(found, parameters, atol=1e-12, rtol=1e-12)
 
 
@@ -68,7 +70,7 @@ def test_batch_dimensions_and_dtype_are_kept(chain, choice, rotations, sizes):
 
 def test_points_of_one_instance_share_its_template(chain, sizes):
     """(4, m, 3) templates against (4, 5, 3) points, as the targets need them."""
-    template, points = chain.canonical(sizes(chain, 4)), random_points(20).reshape(4, 5, 3)
+    template, points = chain.keypoints_from_parameters(sizes(chain, 4)), random_points(20).reshape(4, 5, 3)
     found, margin = chain.choose(NearestToPoint(points), template[:, None].expand(-1, 5, -1, -1))
     assert found.shape == (4, 5, len(chain), 3)
     for i, j in np.ndindex(4, 5):
@@ -99,7 +101,7 @@ def test_a_corner_stands_where_it_is_declared_less_the_centroid():
     ]
     centroid = [0.001, 0.002, 0.003]
     chain = KeypointChain(keypoints, ["a"], cyclic(1), None, lambda p: np.tile(centroid, (len(p), 1)))
-    corner, foot, _, _ = chain.canonical(torch.tensor([[0.010], [0.020]]).double()).unbind(-2)
+    corner, foot, _, _ = chain.keypoints_from_parameters(torch.tensor([[0.010], [0.020]]).double()).unbind(-2)
     assert corner.flatten().tolist() == pytest.approx([0.004, 0.001, -0.013, 0.009, 0.001, -0.023])
     assert foot.flatten().tolist() == pytest.approx([0, -0.003, 0] * 2)  # the plane y = -1 mm
 
@@ -107,7 +109,7 @@ def test_a_corner_stands_where_it_is_declared_less_the_centroid():
 def test_the_canonical_labels_are_the_template_with_no_runner_up(chain, rotations, sizes):
     parameters = sizes(chain, 4)
     labels, margin = chain.select(KeypointChoice(KeypointRule.CANONICAL), parameters, rotations(4))
-    assert torch.equal(labels, chain.canonical(parameters)) and bool(margin.isinf().all())
+    assert torch.equal(labels, chain.keypoints_from_parameters(parameters)) and bool(margin.isinf().all())
 
 
 def test_the_point_rule_asks_for_points(declare, rotations):
@@ -116,8 +118,10 @@ def test_the_point_rule_asks_for_points(declare, rotations):
 
 
 def test_finite_labels_are_the_template_turned_and_seen_through_one_chirality(chain, rotations, sizes):
-    template = chain.canonical(sizes(chain, 60))[:, chain.is_finite]
-    labels, _ = chain.choose(NearestToCamera(rotations(60)), chain.canonical(sizes(chain, 60)))
+    template = chain.keypoints_from_parameters(sizes(chain, 60))[:, chain.is_finite]
+    labels, _ = chain.choose(
+        NearestToCamera(rotations(60)), chain.keypoints_from_parameters(sizes(chain, 60))
+    )
     turned = [
         template @ (g @ chirality).T
         for chirality in chain.chiralities
@@ -140,7 +144,7 @@ def test_a_mirror_makes_a_second_structure_only_where_it_moves_the_keypoints(dec
 
 def test_both_structures_of_a_wedge_are_labels(declare, rotations, sizes):
     chain = declare("wedge")
-    template = chain.canonical(sizes(chain, 40))
+    template = chain.keypoints_from_parameters(sizes(chain, 40))
     labels, _ = chain.choose(NearestToCamera(rotations(40)), template)
     sign = torch.linalg.det(labels[:, 1:]).sign() * torch.linalg.det(template[:, 1:]).sign()
     assert set(sign.tolist()) == {1.0, -1.0}
@@ -149,8 +153,8 @@ def test_both_structures_of_a_wedge_are_labels(declare, rotations, sizes):
 def test_placing_like_an_observation_keeps_free_keypoints_and_resets_finite_ones(declare, rotations, sizes):
     chain = declare("nut")
     parameters, R = sizes(chain, 40), rotations(40)
-    observed, _ = chain.choose(NearestToCamera(R), chain.canonical(parameters))
-    placed, canonical = chain.place_like(parameters, observed), chain.canonical(parameters)
+    observed, _ = chain.choose(NearestToCamera(R), chain.keypoints_from_parameters(parameters))
+    placed, canonical = chain.place_like(parameters, observed), chain.keypoints_from_parameters(parameters)
     torch.testing.assert_close(placed[:, [0, 2]], canonical[:, [0, 2]])
     torch.testing.assert_close(placed[:, 1, :2], observed[:, 1, :2])
     torch.testing.assert_close(placed[:, 1, 2], canonical[:, 1, 2])
@@ -158,14 +162,14 @@ def test_placing_like_an_observation_keeps_free_keypoints_and_resets_finite_ones
 
 def test_placing_like_exact_template_keypoints_gives_them_back(chain, sizes):
     parameters = sizes(chain, 10)
-    canonical = chain.canonical(parameters)
+    canonical = chain.keypoints_from_parameters(parameters)
     torch.testing.assert_close(chain.place_like(parameters, canonical), canonical)
 
 
 def test_placing_uses_the_given_parameters_not_the_observed_distances(chain, sizes):
     parameters = sizes(chain, 10)
-    placed = chain.place_like(parameters, chain.canonical(1.2 * parameters))
-    torch.testing.assert_close(placed, chain.canonical(parameters))
+    placed = chain.place_like(parameters, chain.keypoints_from_parameters(1.2 * parameters))
+    torch.testing.assert_close(placed, chain.keypoints_from_parameters(parameters))
 
 
 def test_a_free_keypoint_observed_on_its_axis_stays_where_the_template_has_it(declare):
@@ -176,7 +180,7 @@ def test_a_free_keypoint_observed_on_its_axis_stays_where_the_template_has_it(de
 
 def test_turning_back_undoes_every_free_choice(chain, rotations, sizes):
     """Labels turned back are, step by step, the template's steps under one symmetry's fixed share."""
-    template = chain.canonical(sizes(chain, 30))
+    template = chain.keypoints_from_parameters(sizes(chain, 30))
     labels, _ = chain.choose(NearestToCamera(rotations(30)), template)
     back = chain.turn_back(labels)
     torch.testing.assert_close(chain.turn_back(back), back, atol=1e-15, rtol=1e-9)
@@ -208,7 +212,9 @@ def test_a_keypoint_on_a_circle_is_not_finite_nor_is_one_that_hangs_on_it(declar
 def test_a_sphere_has_one_keypoint_and_one_parameter(rotations):
     chain = KeypointChain([Keypoint("skin", "centroid", Sphere(), "r")], ["r"], SphericalSymmetry())
     R = rotations(5)
-    labels, margin = chain.choose(NearestToCamera(R), chain.canonical(torch.full((5, 1), 0.01).double()))
+    labels, margin = chain.choose(
+        NearestToCamera(R), chain.keypoints_from_parameters(torch.full((5, 1), 0.01).double())
+    )
     torch.testing.assert_close((labels @ R.mT)[:, 0], torch.tensor([[0, 0, -0.01]]).double().expand(5, 3))
     torch.testing.assert_close(margin, torch.full((5, 1), 0.01).double())
 

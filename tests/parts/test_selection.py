@@ -19,7 +19,7 @@ def test_a_cone_is_measured_from_its_base():
     chain = KeypointChain(
         keypoints, ["r", "h"], RevolutionSymmetry(), None, lambda p: p[:, 1:] / 4 * np.array([[0, 0, 1]])
     )
-    base, rim, tip = chain.canonical(torch.tensor([0.002, 0.012]).double())
+    base, rim, tip = chain.keypoints_from_parameters(torch.tensor([0.002, 0.012]).double())
     assert base.tolist() == pytest.approx([0, 0, -0.003])
     assert rim.norm().item() == pytest.approx(math.hypot(0.002, 0.003)) and rim[2] == base[2]
     assert tip.tolist() == pytest.approx([0, 0, 0.009])

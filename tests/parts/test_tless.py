@@ -48,7 +48,7 @@ def test_tless29_is_two_cuboids(tless29):
 def test_ends_and_sides_are_half_a_size_from_the_base(name, request):
     part = request.getfixturevalue(name)
     size = torch.from_numpy(part.part_object("L", 0))
-    keypoints = dict(zip(part.chain.names, part.chain.canonical(size), strict=True))
+    keypoints = dict(zip(part.chain.names, part.chain.keypoints_from_parameters(size), strict=True))
     base = keypoints["base"]
     assert (keypoints["end"] - base).tolist() == pytest.approx([float(size[0]) / 2, 0, 0])
     assert (keypoints["side"] - base).tolist() == pytest.approx([0, float(size[1]) / 2, 0])
@@ -60,7 +60,7 @@ def test_ends_and_sides_are_half_a_size_from_the_base(name, request):
 def test_end_and_side_are_chosen_independently_because_of_the_mirror(name, request, rotations):
     part, R = request.getfixturevalue(name), rotations(60)
     size = torch.from_numpy(part.part_object("L", 0)).expand(60, -1)
-    labels, _ = part.chain.choose(NearestToCamera(R), part.chain.canonical(size))
+    labels, _ = part.chain.choose(NearestToCamera(R), part.chain.keypoints_from_parameters(size))
     end, side, shoulder = (part.chain.names.index(kp) for kp in ("end", "side", "shoulder"))
     torch.testing.assert_close(labels[:, end, 0], -size[:, 0] / 2 * R[:, 2, 0].sign())
     torch.testing.assert_close(labels[:, side, 1], -size[:, 1] / 2 * R[:, 2, 1].sign())

@@ -60,7 +60,7 @@ def test_half_a_symmetry_turn_does_not(tn06):
 
 def test_the_keypoints_measure_radius_height_and_circumradius(tn06):
     parameters = torch.tensor([0.0055, 0.014, 0.016], dtype=torch.float64)
-    kp1, kp2, kp3 = tn06.chain.canonical(parameters)
+    kp1, kp2, kp3 = tn06.chain.keypoints_from_parameters(parameters)
     assert [float(torch.linalg.vector_norm(v)) for v in (kp2 - kp1, 2 * kp1, kp3 - kp1)] == pytest.approx(
         [0.0055, 0.014, 0.016]
     )
@@ -70,7 +70,7 @@ def test_the_keypoints_measure_radius_height_and_circumradius(tn06):
 def test_the_keypoints_lie_on_the_surface(tn06):
     parameters = tn06.part_object("L", 21)
     vertices = tn06.mesh(parameters).vertices
-    hole, vertex = tn06.chain.canonical(torch.from_numpy(parameters))[1:].numpy()
+    hole, vertex = tn06.chain.keypoints_from_parameters(torch.from_numpy(parameters))[1:].numpy()
     assert cKDTree(vertices).query([hole, vertex])[0].max() < 1e-9
 
 

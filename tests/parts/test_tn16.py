@@ -25,7 +25,7 @@ def test_the_volume_is_cylinder_and_two_cones(part):
 
 
 def test_the_keypoints_are_end_rim_and_apex(part):
-    found = part.chain.canonical(torch.from_numpy(SIZE))
+    found = part.chain.keypoints_from_parameters(torch.from_numpy(SIZE))
     assert part.chain.names == ["end", "rim", "apex"]
     expected = torch.tensor([[0, 0, 0.010], [0.010, 0, 0.010], [0, 0, 0.016]], dtype=torch.float64)
     torch.testing.assert_close(found, expected)

@@ -56,7 +56,7 @@ def test_its_ends_differ(tn34):
 
 def test_the_keypoints_are_the_ends_of_the_axis_and_a_point_of_the_rim(tn34):
     parameters = torch.tensor([0.012, 0.010], dtype=torch.float64)
-    base, top, rim = tn34.chain.canonical(parameters)
+    base, top, rim = tn34.chain.keypoints_from_parameters(parameters)
     low, high = tn34.mesh(parameters.numpy()).bounds[:, 2]
     assert base.tolist() == pytest.approx([0, 0, low])
     assert top.tolist() == pytest.approx([0, 0, high])

@@ -27,12 +27,14 @@ def test_the_centroid_is_the_trapezoids(part):
     l, a, b = SIZE[0], SIZE[1], SMALL_END  # noqa: E741
     expected = [l / 3 * (a + 2 * b) / (a + b), 0, (a * a + a * b + b * b) / (3 * (a + b))]
     np.testing.assert_allclose(part.centroid(SIZE[None])[0], expected, atol=1e-12)
-    foot, *_ = part.chain.canonical(torch.from_numpy(SIZE))
+    foot, *_ = part.chain.keypoints_from_parameters(torch.from_numpy(SIZE))
     np.testing.assert_allclose(foot, [-x for x in expected], atol=1e-12)
 
 
 def test_the_keypoints_measure_length_height_and_thickness(part):
-    keypoints = dict(zip(part.chain.names, part.chain.canonical(torch.from_numpy(SIZE)), strict=True))
+    keypoints = dict(
+        zip(part.chain.names, part.chain.keypoints_from_parameters(torch.from_numpy(SIZE)), strict=True)
+    )
     assert (keypoints["toe"] - keypoints["foot"]).tolist() == pytest.approx([0.030, 0, 0])
     assert (keypoints["head"] - keypoints["foot"]).tolist() == pytest.approx([0, 0, 0.012])
     assert keypoints["side"].tolist() == pytest.approx([0, 0.004, 0])
@@ -40,7 +42,7 @@ def test_the_keypoints_measure_length_height_and_thickness(part):
 
 def test_the_side_is_the_one_nearer_to_the_camera_and_nothing_else_is_chosen(part, rotations):
     R = rotations(60)
-    template = part.chain.canonical(torch.from_numpy(SIZE)).expand(60, -1, -1)
+    template = part.chain.keypoints_from_parameters(torch.from_numpy(SIZE)).expand(60, -1, -1)
     labels, margin = part.chain.choose(NearestToCamera(R), template)
     side = part.chain.names.index("side")
     torch.testing.assert_close(labels[:, side, 1], -0.004 * R[:, 2, 1].sign())

@@ -33,7 +33,9 @@ def labels(
     """(n, m, 3) label keypoints, camera frame; under `point` seen from one of a few places about the part."""
     if choice.rule is POINT:
         points = PLACES[torch.arange(len(R)) % len(PLACES)]
-        return apply_pose(R, t, part.chain.choose(NearestToPoint(points), part.chain.canonical(sizes))[0])
+        return apply_pose(
+            R, t, part.chain.choose(NearestToPoint(points), part.chain.keypoints_from_parameters(sizes))[0]
+        )
     return apply_pose(R, t, part.chain.select(choice, sizes, R)[0])
 
 
@@ -87,7 +89,7 @@ def test_both_chiralities_occur_and_the_better_one_is_taken(
     local = (keypoints - t[:, None]) @ R
     spanned = [0, 1, 2]  # three that span the space: foot, side, toe; the three faces
     handedness = torch.linalg.det(local[:, spanned]) * torch.linalg.det(
-        part.chain.canonical(sizes)[:, spanned]
+        part.chain.keypoints_from_parameters(sizes)[:, spanned]
     )
     mirrored = handedness < 0
     assert 30 < int(mirrored.sum()) < 120
@@ -130,7 +132,9 @@ def test_the_mirror_may_be_a_turn_and_a_reflection_in_one(random_poses, random_s
     R, t = random_poses(100)
     sizes = torch.tensor([0.02, 0.03, 0.01], dtype=torch.float64).expand(100, 3)
     for choice in CHOICES:
-        local = chain.choose(NearestToPoint(PLACES[torch.arange(100) % 4]), chain.canonical(sizes))[0]
+        local = chain.choose(
+            NearestToPoint(PLACES[torch.arange(100) % 4]), chain.keypoints_from_parameters(sizes)
+        )[0]
         if choice.rule is not POINT:
             local = chain.select(choice, sizes, R)[0]
         found_R, found_t = fit_pose(chain, sizes, t, apply_pose(R, t, local))
@@ -162,7 +166,7 @@ def test_no_weight_is_equal_weights(any_part, random_poses, random_sizes, error_
     sizes, m = random_sizes(any_part, 20), len(any_part.chain)
     torch.manual_seed(0)
     off = 1e-3 * torch.randn(20, m, 3, dtype=torch.float64)
-    keypoints = apply_pose(R, t, any_part.chain.canonical(sizes)) + off
+    keypoints = apply_pose(R, t, any_part.chain.keypoints_from_parameters(sizes)) + off
     plain = fit_pose(any_part.chain, sizes, t, keypoints)
     equal = fit_pose(any_part.chain, sizes, t, keypoints, torch.full((20, 1 + m), 7.0, dtype=torch.float64))
     torch.testing.assert_close(plain[1], equal[1])

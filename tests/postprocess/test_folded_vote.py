@@ -24,7 +24,7 @@ def surface_votes(part: ParametricPart, sizes, R, t, counts) -> PointVotes:
     centroid, keypoints, owner = [], [], []
     for i, count in enumerate(counts):
         surface = torch.from_numpy(part.mesh(sizes[i].numpy()).sample(count, seed=i)).double()
-        template = part.chain.canonical(sizes[i]).expand(count, -1, 3)
+        template = part.chain.keypoints_from_parameters(sizes[i]).expand(count, -1, 3)
         keypoints.append(apply_pose(R[i], t[i], part.chain.choose(NearestToPoint(surface), template)[0]))
         centroid.append(t[i].expand(count, 3))
         owner += [i] * count
@@ -63,7 +63,7 @@ def test_the_keypoints_agreed_on_are_as_far_from_their_references_as_the_templat
     part, sizes, _, _, votes = case
     agreed = FOLDED(part, votes)
     lengths = part.chain.steps(agreed.keypoints, agreed.centroid).norm(dim=-1)
-    expected = part.chain.steps(part.chain.canonical(sizes)).norm(dim=-1)
+    expected = part.chain.steps(part.chain.keypoints_from_parameters(sizes)).norm(dim=-1)
     torch.testing.assert_close(lengths, expected, rtol=0, atol=1e-9)
 
 
@@ -110,7 +110,7 @@ def test_votes_for_different_equivalents_meet_where_plain_means_are_far_off(case
 
 def test_a_fold_carries_every_equivalent_to_the_templates_place(any_part, random_sizes):
     sizes = random_sizes(any_part, 1)
-    template = any_part.chain.canonical(sizes)
+    template = any_part.chain.keypoints_from_parameters(sizes)
     turn = rotation_about_z(torch.arange(18).double())
     if any_part.symmetry == SphericalSymmetry():
         turn = torch.from_numpy(Rotation.random(18, 0).as_matrix())
@@ -127,7 +127,7 @@ def test_a_fold_carries_every_equivalent_to_the_templates_place(any_part, random
 @given(seed=st.integers(0, 10**6))
 def test_which_equivalent_a_noisy_vote_means_does_not_matter(any_part, random_sizes, seed):
     chain, generator = any_part.chain, torch.Generator().manual_seed(seed)
-    template = chain.canonical(random_sizes(any_part, 3, seed))
+    template = chain.keypoints_from_parameters(random_sizes(any_part, 3, seed))
     noise = torch.randn(3, 20, len(chain), 3, generator=generator, dtype=torch.float64)
     local = template[:, None] + 0.0005 * noise
     element = chain.group[torch.randint(len(chain.group), (3, 20), generator=generator)]
@@ -137,7 +137,7 @@ def test_which_equivalent_a_noisy_vote_means_does_not_matter(any_part, random_si
 
 def test_a_fold_leaves_a_votes_error_as_large_as_it_was(tn42, random_sizes):
     """A bar's mirror image, 2 mm off: after the fold the error is mirrored too."""
-    template = tn42.chain.canonical(random_sizes(tn42, 1))
+    template = tn42.chain.keypoints_from_parameters(random_sizes(tn42, 1))
     off = torch.tensor([0.001, 0.002, -0.0005], dtype=torch.float64)
     mirror = torch.tensor([1.0, -1, 1], dtype=torch.float64)
     found = fold(tn42.chain, template, (template * mirror + off)[:, None])

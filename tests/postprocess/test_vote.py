@@ -79,7 +79,7 @@ def test_unreliable_votes_leave_the_mean_but_not_the_parameters(tn34):
 
 def test_a_mean_of_different_equivalents_is_none_of_them(tn06):
     """Half the votes for the upper face, half for the lower: the plain mean is the centroid."""
-    local = tn06.chain.canonical(torch.tensor([0.004, 0.011, 0.014], dtype=torch.float64))
+    local = tn06.chain.keypoints_from_parameters(torch.tensor([0.004, 0.011, 0.014], dtype=torch.float64))
     flip = torch.tensor([1.0, -1, -1], dtype=torch.float64)
     keypoints = torch.stack([local, local * flip])
     owner, reliable = torch.zeros(2, dtype=torch.long), torch.ones(2, 4, dtype=torch.bool)

@@ -156,3 +156,15 @@ def test_a_split_that_makes_no_sense_is_named(splits, message):
 def test_counts_below_one_are_refused(limit, step, points):
     with pytest.raises(ValueError, match=f"at least 1, got {limit}, {step}, {points}"):
         protocol(limit, step, points)
+
+
+@pytest.mark.parametrize(("size", "places"), [(16, [0, 11]), (64, [0, 44]), (1, [0])])
+def test_a_share_of_a_grid_is_a_place_in_it(size, places):
+    tasks = protocol(train=SplitPlan("L", cycles=1, objects=[0, 0.7])).tasks({"L": size})
+    assert [task.part_index for task in tasks] == places
+
+
+def test_a_part_without_a_generalization_grid_has_no_split_of_it():
+    plan = protocol(train=SplitPlan("L", cycles=1), test_g=SplitPlan("G", cycles=1))
+    assert {task.split for task in plan.tasks({"L": 2})} == {"train"}
+    assert {task.split for task in plan.tasks({"L": 2, "G": 2})} == {"train", "test_g"}

@@ -34,7 +34,7 @@ def nearest_keypoints(scene: Scene, chain: KeypointChain) -> tuple[Tensor, Tenso
     owner = torch.from_numpy(scene.instance)
     R, t = torch.from_numpy(scene.R)[owner], torch.from_numpy(scene.t)[owner]
     points = apply_inverse_pose(R, t, torch.from_numpy(scene.points).double()[:, None])[:, 0]
-    template = chain.canonical(torch.from_numpy(scene.parameters))[owner]
+    template = chain.keypoints_from_parameters(torch.from_numpy(scene.parameters))[owner]
     local, margin = chain.choose(NearestToPoint(points), template)
     return apply_pose(R, t, local), margin
 

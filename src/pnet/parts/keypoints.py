@@ -61,7 +61,7 @@ class KeypointChain:
         self._typical = np.atleast_2d(sizes)
         self.is_finite = self._find_finite()
         some = self._typical[[0, len(self._typical) // 2, -1]]  # a place may be special for one size
-        templates = self.canonical(torch.from_numpy(some))
+        templates = self.keypoints_from_parameters(torch.from_numpy(some))
         check_declaration(self, symmetry, templates[0])
         self._equivalents = [
             distinct_images(keypoint.primitive, steps, self.group)
@@ -93,7 +93,7 @@ class KeypointChain:
             reference = self.reference[reference - 1]
         return len(torch.unique(member[kept])) if len(images) > 1 else 1
 
-    def canonical(self, parameters: Tensor) -> Tensor:
+    def keypoints_from_parameters(self, parameters: Tensor) -> Tensor:
         """The template's keypoints, in the part frame with the centroid at the origin.
 
         Args:
@@ -124,7 +124,7 @@ class KeypointChain:
         Returns:
             keypoints (..., m, 3) part frame, and margin (..., m), metres; see `choose`.
         """
-        template = self.canonical(parameters)
+        template = self.keypoints_from_parameters(parameters)
         match choice.rule:
             case KeypointRule.CAMERA:
                 return self.choose(NearestToCamera(choice.frame.to(R) @ R), template)
@@ -204,7 +204,7 @@ class KeypointChain:
         Returns:
             (..., m, 3) metres, part frame.
         """
-        return self._replace_free(self.canonical(parameters), observed)
+        return self._replace_free(self.keypoints_from_parameters(parameters), observed)
 
     def turn_back(self, keypoints: Tensor) -> Tensor:
         """Keypoints with the free ones turned to the template's place on their circle or sphere.

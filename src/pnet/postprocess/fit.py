@@ -45,7 +45,7 @@ def _fit_chirality(
     the labels' geometry exactly, whatever the view.
     """
     finite = target.new_tensor([1.0, *map(float, chain.is_finite)])
-    template = _with_centroid(chain.canonical(parameters)) @ mirror.mT
+    template = _with_centroid(chain.keypoints_from_parameters(parameters)) @ mirror.mT
     R, t = fit_rigid(template, target, weight * finite)
     if not all(chain.is_finite):
         observed = apply_inverse_pose(R, t, target[:, 1:]) @ mirror

@@ -24,7 +24,7 @@ def fit_error(part: ParametricPart, rule: KeypointRule, samples: int, seed: int 
     if rule is KeypointRule.POINT:
         generator = torch.Generator().manual_seed(seed)
         direction = torch.randn(samples, 3, dtype=torch.float64, generator=generator)
-        template = part.chain.canonical(parameters)
+        template = part.chain.keypoints_from_parameters(parameters)
         reach = torch.linalg.vector_norm(template, dim=-1).amax(-1, keepdim=True)
         points = reach * torch.nn.functional.normalize(direction, dim=-1)
         local, _ = part.chain.choose(NearestToPoint(points), template)

@@ -52,7 +52,7 @@ class FoldedVote:
         parameters = location(per_point, valid, self.cut)[0]
         R = self._rotation(part, parameters, own_centroid, keypoints, valid)
         local = apply_inverse_pose(R[:, None], centroid[:, None], keypoints)
-        folded = fold(chain, chain.canonical(parameters), local)
+        folded = fold(chain, chain.keypoints_from_parameters(parameters), local)
         places, spreads = zip(*(location(v, valid, self.cut) for v in folded.unbind(2)), strict=True)
         place = torch.stack(places, 1)
         parameters = chain.parameters_from_keypoints(torch.zeros_like(centroid), place)

@@ -87,7 +87,7 @@ def look_from(
 
 def keypoint_places(part: ParametricPart, parameters: Points) -> Points:
     """(1 + m, 3) the centroid and the template's keypoints, part frame, metres; parameters: (k,) metres."""
-    keypoints = part.chain.canonical(torch.from_numpy(parameters)).numpy()
+    keypoints = part.chain.keypoints_from_parameters(torch.from_numpy(parameters)).numpy()
     return np.concatenate([np.zeros((1, 3)), keypoints])
 
 

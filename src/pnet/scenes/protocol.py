@@ -18,7 +18,8 @@ class SplitPlan:
 
     Attributes:
         grid: "L" (part objects that training sees) or "G" (others).
-        objects: indices into the grid, or None for all of them.
+        objects: whole numbers are indices into the grid, numbers like 0.7 a place in it as a share of its
+            size, so that one protocol serves grids of any size; None: all of them.
         first_cycle, cycles: numbers of the cycles of piles; no two splits of one grid may share one.
         clutter: share of clutter cycles, which come beside the piles, in [0, 1); training only.
     """
@@ -26,7 +27,7 @@ class SplitPlan:
     grid: str
     cycles: int
     first_cycle: int = 0
-    objects: Sequence[int] | None = None
+    objects: Sequence[int | float] | None = None
     clutter: float = 0.0
 
     @property
@@ -88,24 +89,36 @@ class Protocol:
         return list(range(self.drop_limit, 0, -self.drop_step))[::-1]
 
     def tasks(self, grid_sizes: Mapping[str, int]) -> list[CycleTask]:
-        """Every file of the data set, small splits first. grid_sizes: part objects of each grid."""
+        """Every file of the data set, small splits first.
+
+        Args:
+            grid_sizes: number of part objects of each grid; splits of a grid that a part lacks are left out.
+        """
         found = []
         for split in sorted(self.splits, key=lambda s: s == "train"):
             plan = self.splits[split]
-            size = grid_sizes[plan.grid]
-            objects = range(size) if plan.objects is None else plan.objects
-            outside = [index for index in objects if not 0 <= index < size]
-            if outside:
-                raise ValueError(
-                    f"protocol {self.name}, split {split}: part object {outside[0]} is not in grid "
-                    f"{plan.grid}, which has 0 to {size - 1}"
-                )
+            if plan.grid not in grid_sizes:
+                continue
+            objects = self._objects(split, grid_sizes[plan.grid])
             for kind, count in (("pile", plan.cycles), ("clutter", plan.clutter_cycles)):
                 cycles = range(plan.first_cycle, plan.first_cycle + count)
                 found += [
                     CycleTask(split, kind, plan.grid, cycle, index) for cycle in cycles for index in objects
                 ]
         return found
+
+    def _objects(self, split: str, size: int) -> list[int]:
+        """Places of a split's part objects in a grid of `size`."""
+        plan = self.splits[split]
+        chosen = range(size) if plan.objects is None else plan.objects
+        places = [int(place * size) if isinstance(place, float) else place for place in chosen]
+        for place in places:
+            if not 0 <= place < size:
+                raise ValueError(
+                    f"protocol {self.name}, split {split}: part object {place} is not in grid "
+                    f"{plan.grid}, which has 0 to {size - 1}"
+                )
+        return list(dict.fromkeys(places))
 
     def _check_disjoint(self) -> None:
         taken: dict[tuple[str, int], str] = {}
