@@ -1,6 +1,7 @@
 """Commands in this process, and one small run that several files look at."""
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -40,7 +41,7 @@ def python_code(command: str) -> str:
 
 @pytest.fixture(scope="session")
 def start() -> Callable[..., "subprocess.Popen[str]"]:
-    """Starts a command as a process of its own."""
+    """Starts a command as a process of its own; Ctrl-C reaches it also where tests run in the background."""
 
     def go(folder: Path, command: str, *arguments: str) -> "subprocess.Popen[str]":
         return subprocess.Popen(
@@ -50,6 +51,7 @@ def start() -> Callable[..., "subprocess.Popen[str]"]:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         )
 
     return go
