@@ -126,6 +126,7 @@ BAD_STEPS = [
     ),
     ({"add": "sphere", "radius": 1, "r": 1}, r"solid\[0\]: a sphere takes radius .* got r, radius"),
     ({"add": "sphere", "radius": 1, "axis": "w"}, r"solid\[0\]: axis is 'w', choose x, y or z"),
+    ({"add": ["sphere"], "radius": 1}, r"solid\[0\]: no shape \['sphere'\]"),
     ({"add": "sphere", "radius": "q"}, r"'q' is not one of the parameters"),
     ({"add": "sphere", "radius": "r.real"}, r"'r.real': a length is made of numbers, parameters"),
     ({"add": "sphere", "radius": "r", "at": [0, "q", 0]}, r"'q' is not one of the parameters"),
@@ -139,6 +140,7 @@ def test_a_bad_step_is_named(step, message):
 
 
 BAD_KEYPOINTS = [
+    (3, "is 3, expected exactly one of plane, "),
     ({"from": "centroid", "plan": "z"}, ".*expected exactly one of plane, .*, did you mean plane"),
     ({"from": "centroid", "measures": "h"}, "is .*, expected exactly one of plane, "),
     ({"from": "centroid", "plane": "z", "circle": "z"}, "is .*, expected exactly one of "),

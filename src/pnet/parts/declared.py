@@ -117,7 +117,7 @@ class _Step:
         self.operation, kind = Operation(operations[0]), fields[operations[0]]
         if index == 0 and self.operation is not Operation.ADD:
             raise ValueError(f"{where}: the first step must add something")
-        if kind not in SHAPES:
+        if not isinstance(kind, str) or kind not in SHAPES:
             raise ValueError(
                 f"{where}: no shape {kind!r}{closest(str(kind), SHAPES)}; there are {', '.join(SHAPES)}"
             )

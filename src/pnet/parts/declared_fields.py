@@ -37,9 +37,12 @@ PRIMITIVES = {
 def keypoint_from(name: str, fields: Fields) -> Keypoint:
     """A keypoint out of its fields; see `DeclaredPart`."""
     where = f"keypoints.{name}"
-    kinds = [key for key in fields if key in PRIMITIVES] if isinstance(fields, Mapping) else []
+    words = list(fields) if isinstance(fields, Mapping) else []
+    kinds = [word for word in words if word in PRIMITIVES]
     if len(kinds) != 1:
-        hints = (closest(str(word), PRIMITIVES) for word in set(fields) - {"from", "measures", "factor"})
+        hints = (
+            closest(str(word), PRIMITIVES) for word in words if word not in ("from", "measures", "factor")
+        )
         raise ValueError(
             f"{where} is {fields}, expected exactly one of {', '.join(PRIMITIVES)}"
             f"{next(filter(None, hints), '')}"
