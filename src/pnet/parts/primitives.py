@@ -100,8 +100,25 @@ class Sphere:
         return self.direction
 
 
+class _Around:
+    """What lies about an axis: the directions of a cylinder and of a polygon."""
+
+    around: Direction
+    towards: Direction | None
+
+    @property
+    def direction(self) -> Tensor:
+        """From the axis to the template's keypoint."""
+        return _towards(self.around, self.towards)
+
+    @property
+    def axis(self) -> Tensor:
+        """The cylinder's axis; the normal of the polygon's plane."""
+        return unit(self.around)
+
+
 @dataclass(frozen=True)
-class Cylinder:
+class Cylinder(_Around):
     """Kp-in-cylinder: the reference lies on the axis, every point at its height is a foot.
 
     Attributes:
@@ -113,19 +130,9 @@ class Cylinder:
     towards: Direction | None = None
 
     @property
-    def direction(self) -> Tensor:
-        """From the axis to the surface."""
-        return _towards(self.around, self.towards)
-
-    @property
     def freedom(self) -> Freedom:
         """A circle."""
         return Freedom.TURN
-
-    @property
-    def axis(self) -> Tensor:
-        """The cylinder's."""
-        return unit(self.around)
 
 
 @dataclass(frozen=True)
@@ -135,7 +142,7 @@ class Circle(Cylinder):
 
 
 @dataclass(frozen=True)
-class Polygon:
+class Polygon(_Around):
     """In-Prim: the reference is the centre of a regular polygon, the keypoint a vertex.
 
     Attributes:
@@ -151,19 +158,9 @@ class Polygon:
             raise ValueError(f"a polygon of {self.sides} sides: expected at least 3")
 
     @property
-    def direction(self) -> Tensor:
-        """From the centre to the first vertex."""
-        return _towards(self.around, self.towards)
-
-    @property
     def freedom(self) -> Freedom:
         """One vertex; the others are its equivalents if the part's symmetry says so."""
         return Freedom.NONE
-
-    @property
-    def axis(self) -> Tensor:
-        """Normal of the polygon's plane."""
-        return unit(self.around)
 
 
 @dataclass(frozen=True)
