@@ -29,9 +29,7 @@ class FiniteSymmetry:
         proper = torch.linalg.det(G) > 0
         if not bool(torch.allclose(G @ G.mT, eye.expand_as(G), atol=1e-6) and proper.all()):
             raise ValueError("symmetry rotations must be orthonormal with determinant +1")
-        products = (G[:, None] @ G[None]).flatten(0, 1)
-        gap = (products[:, None] - G[None]).abs().amax((-1, -2)).amin(1)
-        if bool((gap > 1e-5).any()):
+        if not _is_closed(G):
             raise ValueError("symmetry rotations are not a group: some product is missing")
 
 
@@ -112,11 +110,16 @@ def _mirrored(G: Tensor, mirror: Tensor) -> Tensor:
     if M.shape != (3, 3) or not torch.allclose(M @ M.mT, torch.eye(3).to(G)) or torch.linalg.det(M) > 0:
         raise ValueError("the mirror must be an orthonormal (3, 3) matrix with determinant -1")
     whole = torch.cat([G, G @ M])
-    products = (whole[:, None] @ whole[None]).flatten(0, 1)
-    gap = (products[:, None] - whole[None]).abs().amax((-1, -2)).amin(1)
-    if bool((gap > 1e-5).any()):
+    if not _is_closed(whole):
         raise ValueError("the mirror and the symmetry's rotations are not a group together")
     return G @ M
+
+
+def _is_closed(elements: Tensor) -> bool:
+    """Whether every product of two of the (g, 3, 3) elements is one of them."""
+    products = (elements[:, None] @ elements[None]).flatten(0, 1)
+    gap = (products[:, None] - elements[None]).abs().amax((-1, -2)).amin(1)
+    return bool((gap <= 1e-5).all())
 
 
 def nearest_equivalent(R: Tensor, reference: Tensor, symmetry: Symmetry) -> Tensor:
@@ -139,9 +142,8 @@ def nearest_equivalent(R: Tensor, reference: Tensor, symmetry: Symmetry) -> Tens
             if not reflected:
                 return turned
             flipped = _turn_nearest(R @ torch.tensor(FLIP).to(R), reference)
-            nearer = (flipped[..., 2] * reference[..., 2]).sum(-1) > (turned[..., 2] * reference[..., 2]).sum(
-                -1
-            )
+            axis = reference[..., 2]
+            nearer = (flipped[..., 2] * axis).sum(-1) > (turned[..., 2] * axis).sum(-1)
             return torch.where(nearer[..., None, None], flipped, turned)
         case _:
             return reference

@@ -143,8 +143,7 @@ class KeypointChain:
         Returns:
             keypoints (..., m, 3) metres, part frame; margin (..., m) metres: how much worse the runner-up is,
             for this keypoint, one that it hangs on, or one whose choice binds it. On a circle or sphere
-            runners-up are arbitrarily
-            near: half the cost's range over it stands for the margin.
+            runners-up are arbitrarily near: half the cost's range over it stands for the margin.
         """
         zero = torch.zeros_like(template[..., 0, :])
         chosen, margins = [zero], [torch.full_like(zero[..., 0], torch.inf)]
@@ -187,8 +186,7 @@ class KeypointChain:
         return torch.stack(columns, -1)
 
     def steps(self, keypoints: Tensor, centroid: Tensor | None = None) -> Tensor:
-        """From each keypoint's reference to it: (..., m, 3). centroid: (..., 3), None where it is the
-        origin."""
+        """From each keypoint's reference to it, (..., m, 3); centroid (..., 3), None: the origin."""
         origin = torch.zeros_like(keypoints[..., :1, :]) if centroid is None else centroid[..., None, :]
         return keypoints - torch.cat([origin, keypoints], -2)[..., self.reference, :]
 
