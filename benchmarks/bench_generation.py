@@ -18,7 +18,8 @@ from omegaconf import OmegaConf
 from scipy.spatial import cKDTree
 
 from pnet.cli.instantiate import instantiate
-from pnet.ops.sampling import farthest_point_order, farthest_point_order_plain
+from pnet.ops.operators import plain_operators
+from pnet.ops.sampling import farthest_point_order
 from pnet.records import Scene
 from pnet.scenes.factory import SceneFactory
 from pnet.scenes.generation import CycleReport, cycle_path, generate, open_root
@@ -109,13 +110,14 @@ def compare(factory: SceneFactory, scene: Scene) -> None:
     differing = (np.abs(depth - view.depth) > 1e-4)[view.instance >= 0].mean()
     cloud, count = visible_points(scene, view), factory.protocol.points
     order, sampled = timed(lambda: farthest_point_order(cloud, count))
-    plain, looped = timed(lambda: farthest_point_order_plain(cloud, count, start=int(order[0])), repeats=1)
+    with plain_operators():
+        plain, looped = timed(lambda: farthest_point_order(cloud, count), repeats=1)
     print(f"a full bin of {len(scene.R)} bodies, {len(cloud)} pixels on them")
     print_pair("render_view", rendered, "trimesh, all bodies in one mesh", cast)
     print(f"  {differing:.2%} of the pixels differ by more than 0.1 mm; trimesh gives no silhouettes")
-    print_pair("farthest_point_order", sampled, "plain numpy", looped)
+    print_pair("farthest_point_order", sampled, "plain torch", looped)
     gaps = [1000 * cKDTree(cloud[taken]).query(cloud)[0].max() for taken in (order, plain)]
-    print(f"  no pixel is farther from the sample than {gaps[0]:.4f} mm, plain numpy {gaps[1]:.4f} mm")
+    print(f"  no pixel is farther from the sample than {gaps[0]:.4f} mm, plain torch {gaps[1]:.4f} mm")
 
 
 def render_with_trimesh(scene: Scene, mesh: trimesh.Trimesh) -> np.ndarray:

@@ -3,6 +3,7 @@
 Poses are part → camera; the camera frame has x right, y down, z forward; metres and radians.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,6 +76,7 @@ class Batch:
         parameters: (B, N, k) label: its parameters, metres.
         visibility: (B, N) label: its visibility.
         scene: (B,) index of each scene in the data set.
+        tables: the backbone's neighbour tables of the points, or None where it finds them itself.
     """
 
     points: Tensor
@@ -84,10 +86,17 @@ class Batch:
     parameters: Tensor
     visibility: Tensor
     scene: Tensor
+    tables: dict[str, Tensor] | None = None
 
     def pin_memory(self) -> "Batch":
         """A copy in page-locked memory, for asynchronous transfer; the loader calls it."""
-        return Batch(**{name: value.pin_memory() for name, value in vars(self).items()})
+        return self.map(lambda tensor: tensor.pin_memory())
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> "Batch":
+        """A copy with every tensor changed."""
+        own = {name: change(value) for name, value in vars(self).items() if isinstance(value, Tensor)}
+        tables = None if self.tables is None else {k: change(v) for k, v in self.tables.items()}
+        return Batch(**own, tables=tables)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 import torch
 
-from pnet.backbones.layers import RowBatchNorm, centred, conv_block, gather_rows, shared_mlp
+from pnet.backbones.layers import RowBatchNorm, centred, conv_block, shared_mlp
 
 
 def test_row_batch_norm_is_over_all_rows():
@@ -32,9 +32,3 @@ def test_centred_keeps_the_scale():
     torch.testing.assert_close(
         torch.cdist(centred(points), centred(points)), torch.cdist(points, points), rtol=1e-3, atol=1e-3
     )
-
-
-def test_gather_rows_is_indexing_cloud_by_cloud():
-    rows, index = torch.randn(3, 10, 4), torch.randint(0, 10, (3, 6, 2))
-    expected = torch.stack([rows[b][index[b]] for b in range(3)])
-    assert torch.equal(gather_rows(rows, index), expected)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pnet.backbones.layers import gather_rows
+from pnet.ops.gathering import gather_sum
 from pnet.backbones.pointnet2 import Level, PointNet2
 
 N = 96
@@ -28,7 +28,7 @@ def features(net: PointNet2, points: torch.Tensor) -> torch.Tensor:
 
 def test_every_point_gets_features():
     net = build()
-    assert features(net, clouds()).shape == (2, N, 10) and net.features == 10 and net.min_points == 32
+    assert features(net, clouds()).shape == (2, N, 10) and net.features == 10
 
 
 def test_levels_are_prefixes_of_the_cloud():
@@ -36,17 +36,17 @@ def test_levels_are_prefixes_of_the_cloud():
     tables = net.tables(points)
     shapes = {name: tuple(table.shape) for name, table in tables.items()}
     assert shapes == {
-        "ball_0": (2, 32, 4),
-        "near_0": (2, N, 3),
-        "weight_0": (2, N, 3),
-        "ball_1": (2, 8, 4),
-        "near_1": (2, 32, 3),
-        "weight_1": (2, 32, 3),
+        "ball_1_0": (2, 32, 4),
+        "near_1": (2, N, 3),
+        "weight_1": (2, N, 3),
+        "ball_2_0": (2, 8, 4),
+        "near_2": (2, 32, 3),
+        "weight_2": (2, 32, 3),
     }
-    near = (points[0, tables["ball_0"][0]] - points[0, :32, None]).norm(dim=-1)
+    near = (points[0, tables["ball_1_0"][0]] - points[0, :32, None]).norm(dim=-1)
     assert float(near.max()) <= 0.05
     # a point of the level is its own nearest one there
-    assert torch.equal(tables["near_0"][0, :32, 0], torch.arange(32))
+    assert torch.equal(tables["near_1"][0, :32, 0], torch.arange(32))
 
 
 def test_points_after_the_first_level_may_come_in_any_order():
@@ -77,18 +77,8 @@ def test_a_radius_scale_is_a_scale_of_the_cloud():
 def test_interpolating_a_constant_gives_it_back():
     tables = build().tables(clouds())
     constant = torch.full((2, 32, 5), 3.25)
-    spread = (gather_rows(constant, tables["near_0"]) * tables["weight_0"][..., None]).sum(2)
+    spread = gather_sum(constant, tables["near_1"], tables["weight_1"])
     torch.testing.assert_close(spread, torch.full((2, N, 5), 3.25))
-
-
-def test_grouping_is_relative_and_in_units_of_the_radius():
-    net, points = build(neighbours=4), clouds()
-    ball = net.tables(points)["ball_0"]
-    grouped = net._group(points, points[:, :32], None, ball, net._levels[0])
-    b, i, j = 1, 7, 2
-    expected = (points[b, ball[b, i, j]] - points[b, i]) / 0.05
-    torch.testing.assert_close(grouped[b, i, j], expected)
-    assert float(grouped.norm(dim=-1).max()) <= 1 + 1e-5
 
 
 def test_the_gradient_reaches_every_weight():
@@ -110,13 +100,11 @@ def test_weights_travel_as_a_state_dict():
     assert torch.equal(features(other.eval(), clouds()), features(net.eval(), clouds()))
 
 
-def test_a_small_cloud_is_refused():
-    net = build()
-    net.check(32)
-    with pytest.raises(
-        ValueError, match=r"PointNet2 needs clouds of at least 32 points, got 31; raise data\.points"
-    ):
-        net.check(31)
+def test_a_small_cloud_has_smaller_levels():
+    net, points = build(neighbours=4).eval(), clouds()[:, :5]
+    tables = net.tables(points)
+    assert tables["ball_1_0"].shape == (2, 5, 4) and tables["ball_2_0"].shape == (2, 5, 4)
+    assert features(net, points).shape == (2, 5, 10) and features(net, points[:, :1]).shape == (2, 1, 10)
 
 
 def test_every_level_needs_its_way_up():

@@ -131,7 +131,6 @@ def test_weights_travel_as_a_state_dict():
 
 def test_one_point_is_enough():
     net = build().eval()
-    net.check(1)
     assert bool(features(net, torch.tensor([[[0.01, 0.02, 0.6]]])).isfinite().all())
 
 

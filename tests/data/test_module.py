@@ -5,6 +5,7 @@ import torch
 
 from pnet.data.augmentation import Augmentation
 from pnet.data.module import SceneDataModule, Targets
+from pnet.ops.pyramid import Ball, Pyramid
 from pnet.parts.choice import KeypointRule
 
 
@@ -32,7 +33,8 @@ def order(data, epochs):
 
 def test_shapes_of_a_batch(root, tn06):
     batch = next(iter(module(root, tn06, points=100).train_dataloader()))
-    shapes = {name: tuple(value.shape) for name, value in vars(batch).items()}
+    assert batch.tables is None
+    shapes = {name: tuple(value.shape) for name, value in vars(batch).items() if name != "tables"}
     assert shapes == {
         "points": (4, 100, 3),
         "centroid": (4, 100, 3),
@@ -42,6 +44,17 @@ def test_shapes_of_a_batch(root, tn06):
         "visibility": (4, 100),
         "scene": (4,),
     }
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_the_loader_finds_the_tables_of_the_points_as_augmented(root, tn06, workers):
+    pyramid = Pyramid([30, 8], [[Ball(0.01, 6)], [Ball(0.02, 4), Ball(0.04, 4)]], [0.01])
+    data = module(root, tn06, points=100, workers=workers, pyramid=pyramid)
+    for batch in (next(iter(data.train_dataloader())), next(iter(data.val_dataloader()))):
+        expected = pyramid(batch.points)
+        assert batch.tables.keys() == expected.keys() and len(expected) == 8
+        for name, table in expected.items():
+            assert torch.equal(batch.tables[name], table), name
 
 
 def test_training_drops_the_rest_and_validation_does_not(root, tn06):

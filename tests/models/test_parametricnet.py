@@ -50,6 +50,7 @@ def test_the_gradient_reaches_every_weight(points):
     assert not [name for name, p in net.named_parameters() if p.grad is None or not bool(p.grad.any())]
 
 
-def test_a_cloud_smaller_than_the_finest_level_is_refused(points):
-    with pytest.raises(ValueError, match="at least 16 points, got 15"):
-        build()(points[:, :15])
+def test_tables_may_be_given_or_found(points):
+    net = build().eval()
+    given = net(points, net.backbone.tables(points))
+    assert torch.equal(given.keypoints, net(points).keypoints)

@@ -4,26 +4,27 @@ from abc import ABC, abstractmethod
 
 from torch import Tensor, nn
 
-Tables = dict[str, Tensor]  # what depends on geometry alone: neighbour indices, cells, weights
+from pnet.ops.pyramid import Pyramid, Tables
 
 
 class Backbone(nn.Module, ABC):
     """Per-point features of a cloud.
 
     Attributes:
-        features: F, channels of the output. min_points: fewest points of a cloud.
+        features: F, channels of the output. pyramid: the neighbour tables that it needs and that depend on
+            one cloud alone, so that a data loader can find them; None: nothing of the kind.
     """
 
     features: int
-    min_points: int = 1
+    pyramid: Pyramid | None = None
 
-    @abstractmethod
     def tables(self, points: Tensor) -> Tables:
         """Neighbour tables of clouds; found once, outside autograd.
 
         Args:
             points: (B, N, 3) metres, camera frame, in farthest-point-sampling order.
         """
+        return {} if self.pyramid is None else self.pyramid(points)
 
     @abstractmethod
     def forward(self, points: Tensor, tables: Tables) -> Tensor:
@@ -34,11 +35,3 @@ class Backbone(nn.Module, ABC):
         Returns:
             (B, N, F).
         """
-
-    def check(self, points: int) -> None:
-        """Raise ValueError where a cloud of so many points is too small for this backbone."""
-        if points < self.min_points:
-            raise ValueError(
-                f"{type(self).__name__} needs clouds of at least {self.min_points} points, got {points}; "
-                "raise data.points or choose smaller levels in the backbone's config"
-            )

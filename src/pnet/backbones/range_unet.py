@@ -11,8 +11,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from pnet.backbones.base import Backbone, Tables
-from pnet.backbones.layers import conv_block, gather_rows, shared_mlp
+from pnet.backbones.base import Backbone
+from pnet.backbones.layers import conv_block, shared_mlp
+from pnet.ops.gathering import gather_rows
+from pnet.ops.pyramid import Tables
 
 MAX_CELLS = 1024  # a side; points farther out share the cells of the border
 CELL_FEATURES = 4  # where in the cell the points lie (2), their depth, whether there are any

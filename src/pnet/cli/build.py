@@ -48,10 +48,10 @@ def build_parts(cfg: DictConfig) -> Parts:
     return Parts(part, network.to(memory_format=torch.channels_last), recovery)
 
 
-def build_data(cfg: DictConfig, part: ParametricPart) -> SceneDataModule:
+def build_data(cfg: DictConfig, parts: Parts) -> SceneDataModule:
     """The data module of a config; an epoch lasts from one checkpoint to the next."""
     return SceneDataModule(
-        part,
+        parts.part,
         cfg.data.root,
         instantiate(cfg.data.targets),
         instantiate(cfg.data.augmentation),
@@ -61,6 +61,7 @@ def build_data(cfg: DictConfig, part: ParametricPart) -> SceneDataModule:
         cfg.data.val_every,
         cfg.data.workers,
         cfg.seed,
+        parts.network.backbone.pyramid,
     )
 
 

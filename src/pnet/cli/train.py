@@ -41,10 +41,9 @@ def train(cfg: DictConfig) -> None:
     checkpoint = resume_from(cfg.ckpt, run / "checkpoints" / NAME)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
     parts, bf16 = build_parts(cfg), use_bf16(cfg.trainer.precision, cfg.trainer.accelerator)
-    data = build_data(cfg, parts.part)
+    data = build_data(cfg, parts)
     validation = data.scenes("val", cfg.data.val_every)
     data.train_dataloader()  # says now, before anything is written, what is wrong with the data
-    parts.network.backbone.check(cfg.data.points or validation.points_per_scene)
     module = PoseTraining(
         parts.network,
         instantiate(cfg.loss, chain=parts.part.chain),

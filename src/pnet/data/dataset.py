@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset, Sampler
+from torch.utils.data import Dataset, Sampler, default_collate
 
 from pnet.data.augmentation import Augmentation
 from pnet.data.scene_folder import SceneFolder
 from pnet.data.targets import point_labels
+from pnet.ops.pyramid import Pyramid, Tables
 from pnet.parts.choice import KeypointChoice
 from pnet.parts.keypoints import KeypointChain
 from pnet.records import Batch, Scene
@@ -18,13 +19,17 @@ from pnet.records import Batch, Scene
 Draw = tuple[int, int]  # scene index and epoch: all that chance depends on, besides the seed
 
 
-class LabelledScenes(Dataset[dict[str, Tensor]]):
+Item = dict[str, Tensor | Tables]
+
+
+class LabelledScenes(Dataset[Item]):
     """Scenes with labels, augmented by (seed, epoch, index) alone, so that a resumed run repeats itself.
 
     Args:
         scenes: where they come from. chain: the part's keypoints. choice: which equivalent is the label.
         points: take the first so many of each scene's points (they are in sampling order), or None.
         augmentation: for training, else None. seed: of the augmentation.
+        pyramid: the backbone's neighbour tables to find here, by the loader's workers; None: none.
     """
 
     def __init__(
@@ -35,6 +40,7 @@ class LabelledScenes(Dataset[dict[str, Tensor]]):
         points: int | None = None,
         augmentation: Augmentation | None = None,
         seed: int = 0,
+        pyramid: Pyramid | None = None,
     ) -> None:
         if points is not None and points > scenes.points_per_scene:
             raise ValueError(
@@ -43,18 +49,21 @@ class LabelledScenes(Dataset[dict[str, Tensor]]):
             )
         self.scenes, self.points = scenes, points
         self._chain, self._choice = chain, choice
-        self._augmentation, self._seed = augmentation, seed
+        self._augmentation, self._seed, self._pyramid = augmentation, seed, pyramid
 
     def __len__(self) -> int:
         return len(self.scenes)
 
-    def __getitem__(self, draw: Draw | int) -> dict[str, Tensor]:
+    def __getitem__(self, draw: Draw | int) -> Item:
         index, epoch = (draw, 0) if isinstance(draw, int) else draw
         scene = first_points(self.scenes[index], self.points)
         if self._augmentation is not None:
             scene = self._augmentation(scene, np.random.default_rng([self._seed, epoch, index]))
         labels = point_labels(scene, self._chain, self._choice)
-        return {**labels, "scene": torch.tensor(index)}
+        item: Item = {**labels, "scene": torch.tensor(index)}
+        if self._pyramid is not None:  # of the points as augmented: octants follow the axes
+            item["tables"] = {k: v[0] for k, v in self._pyramid(labels["points"][None]).items()}
+        return item
 
 
 def first_points(scene: Scene, count: int | None) -> Scene:
@@ -64,9 +73,9 @@ def first_points(scene: Scene, count: int | None) -> Scene:
     return replace(scene, points=scene.points[:count], instance=scene.instance[:count])
 
 
-def collate(items: list[dict[str, Tensor]]) -> Batch:
-    """Stack labelled scenes."""
-    return Batch(**{name: torch.stack([item[name] for item in items]) for name in items[0]})
+def collate(items: list[Item]) -> Batch:
+    """Stack labelled scenes, and their tables."""
+    return Batch(**default_collate(items))
 
 
 class EpochSampler(Sampler[Draw]):

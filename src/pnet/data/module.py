@@ -12,6 +12,7 @@ from torch.utils.data import DataLoader
 from pnet.data.augmentation import Augmentation
 from pnet.data.dataset import EpochSampler, LabelledScenes, collate
 from pnet.data.scene_folder import SceneFolder
+from pnet.ops.pyramid import Pyramid
 from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointChoice, KeypointRule
 
@@ -47,6 +48,7 @@ class SceneDataModule(lightning.LightningDataModule):
         points: N, the first so many of a scene's points; None: all.
         batch_size: scenes. draws: scenes of an epoch; None: each once.
         val_every: keep every so many validation scenes. workers: loader processes. seed: of order and chance.
+        pyramid: the backbone's neighbour tables for the loaders to find, or None.
     """
 
     def __init__(
@@ -61,6 +63,7 @@ class SceneDataModule(lightning.LightningDataModule):
         val_every: int,
         workers: int,
         seed: int,
+        pyramid: Pyramid | None = None,
     ) -> None:
         super().__init__()
         if points is not None and points < 1:
@@ -70,6 +73,7 @@ class SceneDataModule(lightning.LightningDataModule):
         self.part, self.root, self.targets, self.points = part, Path(root), targets, points
         self._augmentation, self._batch_size, self._draws = augmentation, batch_size, draws
         self._val_every, self._workers, self._seed = val_every, workers, seed
+        self._pyramid = pyramid
 
     def scenes(self, split: str, every: int = 1) -> SceneFolder:
         """The scenes of a split."""
@@ -79,7 +83,13 @@ class SceneDataModule(lightning.LightningDataModule):
         """Training scenes, augmented, in an order that (seed, epoch) decides."""
         scenes = self.scenes("train")
         dataset = LabelledScenes(
-            scenes, self.part.chain, self.targets.choice, self.points, self._augmentation, self._seed
+            scenes,
+            self.part.chain,
+            self.targets.choice,
+            self.points,
+            self._augmentation,
+            self._seed,
+            self._pyramid,
         )
         if (self._draws or len(scenes)) < self._batch_size:
             raise ValueError(
@@ -98,7 +108,9 @@ class SceneDataModule(lightning.LightningDataModule):
         return self._unchanged(self.scenes(split))
 
     def _unchanged(self, scenes: SceneFolder) -> DataLoader[Any]:
-        dataset = LabelledScenes(scenes, self.part.chain, self.targets.choice, self.points)
+        dataset = LabelledScenes(
+            scenes, self.part.chain, self.targets.choice, self.points, pyramid=self._pyramid
+        )
         return self._loader(dataset, None, drop_last=False)
 
     def _loader(

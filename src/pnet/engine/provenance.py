@@ -24,7 +24,7 @@ PACKAGES = (
     "manifold3d",
     "embreex",
     "pybullet",
-    "fpsample",
+    "numba",
     "roma",
     "safetensors",
 )

@@ -67,8 +67,7 @@ class PoseTraining(lightning.LightningModule):
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, index: int) -> Batch:
         """Lightning knows no frozen records: move each tensor."""
-        moved = {k: v.to(device, non_blocking=True) for k, v in vars(batch).items()}
-        return Batch(**moved)
+        return batch.map(lambda tensor: tensor.to(device, non_blocking=True))
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keep what the weights belong to."""
@@ -80,7 +79,7 @@ class PoseTraining(lightning.LightningModule):
 
     def _losses(self, batch: Batch) -> dict[str, Tensor]:
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16):
-            predicted = self.network(batch.points)
+            predicted = self.network(batch.points, batch.tables)
         return self.loss(predicted, batch)
 
     def _log(self, stage: str, losses: dict[str, Tensor], size: int) -> None:

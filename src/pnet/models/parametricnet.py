@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from pnet.backbones.base import Backbone, Tables
+from pnet.backbones.base import Backbone
 from pnet.models.heads import OffsetHead, VisibilityHead
+from pnet.ops.pyramid import Tables
 from pnet.records import PointPrediction
 
 
@@ -41,7 +42,6 @@ class ParametricNet(nn.Module):
             points: (B, N, 3) camera frame, metres, in sampling order.
             tables: of the same points, or None to find them here.
         """
-        self.backbone.check(points.shape[1])
         if tables is None:
             tables = self.backbone.tables(points)
         features = self.backbone(points, tables)

@@ -1,44 +1,59 @@
-"""Farthest point sampling."""
+"""Farthest point sampling (Eldar et al. 1997)."""
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
+
+from pnet.ops.operators import check_clouds, operator, squared_distance
 
 
-def farthest_point_order(points: NDArray[np.floating], count: int) -> NDArray[np.int64]:
-    """Indices of farthest point sampling (Eldar et al. 1997).
+def farthest_points(points: Tensor, count: int, start: int = 0) -> Tensor:
+    """Indices of farthest point sampling: each next point is the one farthest from those before.
 
-    The order is progressive: its first k indices are the k-point sample. The library counts the start
-    in its tree's order, so which point comes first is the tree's choice: the same for equal clouds.
+    The order is progressive: its first k indices are the k-point sample. Ties go to the smaller index.
 
     Args:
-        points: (n, 3), n >= 1, finite. count: how many, at least 1.
+        points: (B, N, 3) metres. count: how many, at least 1. start: index of the first.
     Returns:
-        (count,) indices; where count > n all points come first and are then repeated in order.
+        (B, count) int64; where count > N all points come first and are then repeated in order.
     """
-    import fpsample
-
-    n = len(points)
-    if n == 0:
-        raise ValueError("farthest point sampling needs at least one point")
-    if not np.isfinite(points).all():
-        raise ValueError("farthest point sampling got NaN or infinite coordinates")
-    taken = min(count, n)
-    if n == 1:
-        order = np.zeros(1, np.int64)
-    else:
-        height = int(np.clip(np.log2(n / 64), 1, 9))  # buckets of about 64 points
-        cloud = np.ascontiguousarray(points, np.float32)
-        order = fpsample.bucket_fps_kdline_sampling(cloud, taken, h=height, start_idx=0)
-    return np.resize(order.astype(np.int64), count)
+    check_clouds(points=points)
+    if count < 1 or not 0 <= start < points.shape[1]:
+        raise ValueError(f"cannot take {count} of {points.shape[1]} points from index {start} on")
+    order: Tensor = _farthest_points(points.detach(), count, start)
+    return order
 
 
-def farthest_point_order_plain(points: NDArray[np.floating], count: int, start: int = 0) -> NDArray[np.int64]:
-    """The plain twin of `farthest_point_order`, from a given start: one pass over all points per choice."""
-    cloud = np.asarray(points, np.float32)
-    taken = min(count, len(cloud))
-    order = np.full(taken, start, np.int64)
-    nearest = np.full(len(cloud), np.inf, np.float32)
+def farthest_point_order(points: NDArray[np.floating], count: int, start: int = 0) -> NDArray[np.int64]:
+    """The same for one numpy cloud (n, 3), in float32; (count,) indices."""
+    cloud = torch.from_numpy(np.array(points, np.float32, ndmin=2))
+    return farthest_points(cloud[None], count, start)[0].numpy()
+
+
+@operator
+def _farthest_points(points: Tensor, count: int, start: int) -> Tensor:
+    """One pass over all points per choice."""
+    B, n, _ = points.shape
+    cloud, taken = torch.arange(B, device=points.device), min(count, n)
+    order = torch.full((B, taken), start, device=points.device)
+    gap = points.new_full((B, n), torch.inf)
     for i in range(1, taken):
-        nearest = np.minimum(nearest, ((cloud - cloud[order[i - 1]]) ** 2).sum(1))
-        order[i] = nearest.argmax()
-    return np.resize(order, count)
+        last = order[:, i - 1]
+        gap = torch.minimum(gap, squared_distance(points, points[cloud, last][:, None]))
+        gap[cloud, last] = -1.0  # so that it is not chosen again, not even where points coincide
+        farthest = gap == gap.amax(1, keepdim=True)
+        order[:, i] = torch.where(farthest, torch.arange(n, device=points.device), n).amin(1)
+    return order[:, torch.arange(count, device=points.device) % taken]
+
+
+@_farthest_points.register_kernel("cpu")
+def _(points: Tensor, count: int, start: int) -> Tensor:
+    from pnet.ops.cpu import sampling as kernels
+
+    return kernels.farthest_points(points.contiguous(), count, start)
+
+
+@_farthest_points.register_fake
+def _(points: Tensor, count: int, start: int) -> Tensor:
+    return points.new_empty(points.shape[0], count, dtype=torch.int64)

@@ -1,0 +1,78 @@
+"""How an operator comes to its kernels.
+
+Each operator is a `torch.library` custom operator `pnet::…`, so autograd, export and torch.compile know it.
+The function under `@operator` is its plain torch reference and runs on any device; a faster kernel for a
+device registers beside it (`register_kernel("cpu")`, later "cuda") and is imported at its first use.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from typing import Any, Protocol, TypeVar, cast
+
+import torch
+from torch import Tensor
+
+Function = TypeVar("Function", bound=Callable[..., object])
+
+
+class Operator(Protocol):
+    """What is used of torch's private `CustomOpDef`."""
+
+    def __call__(self, *args: Any) -> Any: ...
+
+    def register_kernel(self, device: str) -> Callable[[Function], Function]: ...
+
+    def register_fake(self, function: Function) -> Function: ...
+
+    def register_autograd(self, backward: Any, *, setup_context: Any) -> None: ...
+
+    def set_kernel_enabled(self, device: str, enabled: bool) -> AbstractContextManager[None]: ...
+
+
+OPERATORS: dict[str, Operator] = {}
+DEVICES = ("cpu",)  # with kernels of their own
+
+
+def operator(reference: Callable[..., object]) -> Operator:
+    """Make a plain torch function the operator `pnet::<its name>`."""
+    name = reference.__name__.strip("_")
+    made = cast(Operator, torch.library.custom_op(f"pnet::{name}", reference, mutates_args=()))
+    OPERATORS[name] = made
+    return made
+
+
+@contextmanager
+def plain_operators() -> Iterator[None]:
+    """Run the references instead of the kernels: for comparison, and where a kernel is at fault."""
+    with ExitStack() as stack:
+        for made in OPERATORS.values():
+            for device in DEVICES:
+                stack.enter_context(made.set_kernel_enabled(device, enabled=False))
+        yield
+
+
+def squared_distance(a: Tensor, b: Tensor) -> Tensor:
+    """(..., 3), (..., 3) → (...), summed in the order of the kernels, so that rounding is the same."""
+    d = a - b
+    return d[..., 0] * d[..., 0] + d[..., 1] * d[..., 1] + d[..., 2] * d[..., 2]
+
+
+def squared(radius: float, points: Tensor) -> float:
+    """The radius' square as a number of the points' precision: all kernels compare with the same one."""
+    if not radius > 0:
+        raise ValueError(f"the radius is {radius}, expected more than 0 metres")
+    return float(torch.tensor(radius * radius, dtype=points.dtype))
+
+
+def check_clouds(**clouds: Tensor) -> None:
+    """Raise ValueError where a cloud is not (B, N, 3), has no point or is not finite; names the argument."""
+    for name, cloud in clouds.items():
+        if cloud.ndim != 3 or cloud.shape[2] != 3 or cloud.shape[1] == 0:
+            raise ValueError(f"{name}: shape {tuple(cloud.shape)}, expected (B, N, 3), at least one point")
+        if not cloud.is_floating_point() or cloud.element_size() < 4:
+            raise ValueError(f"{name} is {cloud.dtype}, expected float32 or float64")
+        if cloud.device.type == "cpu" and not bool(torch.isfinite(cloud).all()):
+            raise ValueError(f"{name} has NaN or infinite coordinates")
+    if len({len(cloud) for cloud in clouds.values()}) > 1:
+        shapes = ", ".join(f"{name} {tuple(cloud.shape)}" for name, cloud in clouds.items())
+        raise ValueError(f"the clouds differ in number: {shapes}")
