@@ -72,7 +72,7 @@ MISSPELT = [
     ("train", "trainer.step=5", "trainer.step: unknown key, did you mean trainer.steps"),
     ("train", "sed=1", "sed: unknown key, did you mean seed"),
     ("train", "postprocess.clutser.bandwidth=1", "did you mean postprocess.cluster.bandwidth"),
-    ("train", "backbone=pointnet", "backbone=pointnet: no such choice, did you mean pointnet2"),
+    ("train", "backbone=pointnt2", "backbone=pointnt2: no such choice, did you mean pointnet2"),
     ("train", "part=tn43", "part=tn43: no such choice, did you mean"),
     ("train", "backbones=pointnet2", "backbones: unknown key, did you mean backbone"),
     ("train", "experiment=papr", "no such choice, did you mean paper"),

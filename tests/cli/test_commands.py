@@ -178,8 +178,6 @@ def test_other_settings_of_post_processing_lie_beside(smoke_copy, run_here):
 # what is refused: one line, exit code 1, nothing written
 
 BAD_TRAINING = [
-    (("backbone=pointnet2",), "PointNet2 needs clouds of at least 4096 points, got 512"),
-    (("data.points=100",), "PointNet2 needs clouds of at least 256 points, got 100"),
     (("data.points=1000",), "data.points is 1000, the stored scenes have 512"),
     (("data.root=nowhere",), "nowhere"),
     (("part=tn06", "data.root=outputs/data/tn34_smoke"), "shows tn34, not tn06; set part=tn34"),

@@ -32,6 +32,7 @@ def train(cfg: DictConfig) -> None:
     from pnet.engine.estimator import NetworkEstimator
     from pnet.engine.provenance import provenance, read_json, write_json
     from pnet.engine.training import PoseTraining, check_identity
+    from pnet.models.summary import summarise
     from pnet.scenes.generation import read_manifest, settings_fingerprint
     from pnet.scenes.store import write_atomically
 
@@ -72,6 +73,8 @@ def train(cfg: DictConfig) -> None:
     write_atomically(run / RESOLVED, OmegaConf.to_yaml(cfg, resolve=True).encode())
     write_json(run / "provenance.json", provenance(cfg.seed))
     (run / "metrics.json").unlink(missing_ok=True)
+    summary = summarise(parts.network, torch.from_numpy(validation[0].points[: cfg.data.points]))
+    print(summary)
     try:
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     except SystemExit:  # what Lightning makes of Ctrl-C
@@ -80,6 +83,7 @@ def train(cfg: DictConfig) -> None:
         trainer.validate(module, datamodule=data, verbose=False)
     metrics = final_metrics(trainer, throughput)
     log_settings(trainer, cfg, metrics)
+    metrics["network"] = vars(summary)
     write_json(run / "metrics.json", metrics)
     print_end(run, metrics)
 

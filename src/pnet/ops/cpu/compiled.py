@@ -1,8 +1,10 @@
 """How kernels are compiled and spread over threads."""
 
 import os
+import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
@@ -10,11 +12,17 @@ import torch
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
+# Numba looks at a kernel's own file to see whether what it kept is out of date, not at the files of the
+# kernels that it calls: so their content is part of the name under which it is kept.
+_SOURCES = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
+_VERSION = f"{zlib.crc32(_SOURCES):08x}"
+
 _pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
 
 
 def kernel(function: Function) -> Function:
     """Compile for the CPU, without the interpreter's lock; kept on disk where a folder can be written."""
+    function.__qualname__ += f"-{_VERSION}"
     compiled: Any
     try:
         compiled = numba.njit(nogil=True, cache=True)(function)

@@ -194,7 +194,7 @@ def _octants(tree: Tree, limit: float, found: Array, start: int, stop: int) -> N
 def _serves(low: Array, high: Array, node: int, x: float, y: float, z: float, best: Array) -> bool:
     """Whether a node's box may hold, in some octant, a point as near as the best found there."""
     zero = x - x
-    far = np.inf
+    far = low.dtype.type(np.inf)  # a double would make the sums below differ from those of points
     x1 = max(zero, low[node, 0] - x) if high[node, 0] > x else far
     x0 = max(zero, x - high[node, 0]) if low[node, 0] <= x else far
     y1 = max(zero, low[node, 1] - y) if high[node, 1] > y else far
