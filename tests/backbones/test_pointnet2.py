@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+from torch.utils.data import default_collate
 
-from pnet.ops.gathering import gather_sum
 from pnet.backbones.pointnet2 import Level, PointNet2
+from pnet.ops.gathering import gather_sum
 
 N = 96
 
@@ -107,6 +108,45 @@ def test_a_small_cloud_has_smaller_levels():
     assert features(net, points).shape == (2, 5, 10) and features(net, points[:, :1]).shape == (2, 1, 10)
 
 
+@pytest.mark.parametrize("delayed", [True, False])
+def test_scales_of_a_level_stand_side_by_side(delayed):
+    torch.manual_seed(0)
+    levels = [Level(32, [0.03, 0.06, 0.1], 8, [8, 12]), Level(8, [0.1, 0.2], 6, [16], delayed)]
+    net, points = PointNet2(levels, [[16, 12], [12, 10]]), clouds()
+    assert [step.features for step in net.abstraction] == [36, 32]
+    tables = net.tables(points)
+    assert [tuple(tables[f"ball_1_{s}"].shape) for s in range(3)] == [(2, 32, 8)] * 3
+    assert [tuple(tables[f"ball_2_{s}"].shape) for s in range(2)] == [(2, 8, 6)] * 2
+    near = (points[0, tables["ball_1_1"][0]] - points[0, :32, None]).norm(dim=-1)
+    assert 0.03 < float(near.max()) <= 0.06
+    assert features(net, points).shape == (2, N, 10)
+
+
+def test_delayed_levels_keep_what_a_network_keeps():
+    torch.manual_seed(0)
+    levels = [Level(32, 0.05, N, (8, 8)), Level(8, 0.15, N, (8, 16), delayed=True)]
+    net, points = PointNet2(levels, [[16, 12], [12, 10]]), clouds()
+    (features(net, points) * torch.randn(10)).sum().backward()
+    assert all(bool(p.grad.abs().sum() > 0) for p in net.parameters())
+    net.eval()
+    order = torch.cat([torch.arange(32), 32 + torch.randperm(N - 32)])
+    moved = points[:, order] + torch.tensor([0.25, -0.5, 0.125])
+    torch.testing.assert_close(features(net, moved), features(net, points)[:, order], rtol=1e-3, atol=1e-4)
+
+
+def test_tables_found_scene_by_scene_give_the_same_features():
+    net, points = build(neighbours=8).eval(), clouds(batch=3)
+    each = [{name: table[0] for name, table in net.tables(cloud[None]).items()} for cloud in points]
+    assert torch.equal(net(points, default_collate(each)), features(net, points))
+
+
 def test_every_level_needs_its_way_up():
     with pytest.raises(ValueError, match="2 levels need as many propagation MLPs, got 1"):
         PointNet2([Level(8, 0.1, 4, [4]), Level(4, 0.1, 4, [4])], [[4]])
+
+
+def test_a_delayed_level_without_features_below_has_one_layer():
+    with pytest.raises(ValueError, match=r"delayed level needs features below it for its MLP \[8, 16\]"):
+        PointNet2([Level(32, 0.05, 8, [8, 16], delayed=True)], [[12]])
+    net = PointNet2([Level(32, 0.05, 8, [16], delayed=True)], [[12]])
+    assert features(net, clouds()).shape == (2, N, 12)

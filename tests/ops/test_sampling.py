@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
 from pnet.ops.operators import plain_operators
-from pnet.ops.sampling import farthest_point_order
+from pnet.ops.sampling import farthest_point_order, farthest_points
 
 
 def farthest_point_order_plain(points: np.ndarray, count: int, start: int = 0) -> np.ndarray:
@@ -131,3 +132,56 @@ def test_coordinates_that_are_not_finite_are_refused(bad):
 def test_an_empty_cloud_is_refused():
     with pytest.raises(ValueError, match="at least one point"):
         farthest_point_order(np.zeros((0, 3)), 3)
+
+
+def test_the_kernel_is_the_reference_on_any_cloud(clouds):
+    n = clouds.shape[1]
+    for count, start in ((1, 0), (min(n, 400), n // 2), (n + 7, n - 1)):
+        taken = farthest_points(clouds, count, start)
+        with plain_operators():
+            assert torch.equal(taken, farthest_points(clouds, count, start))
+        assert taken.shape == (len(clouds), count) and taken.dtype == torch.int64
+        assert bool((taken[:, 0] == start).all())
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 120), st.integers(1, 6), st.booleans(), st.integers(0, 10_000))
+def test_ties_go_to_the_smaller_index(n, width, double, seed):
+    rng = np.random.default_rng(seed)
+    cloud = 0.1 * rng.integers(0, width, (1, n, 3)) if double else rng.integers(0, width, (1, n, 3))
+    points, start = torch.from_numpy(cloud).to(torch.float64 if double else torch.float32), seed % n
+    taken = farthest_points(points, n, start)
+    with plain_operators():
+        assert torch.equal(taken, farthest_points(points, n, start))
+    if not double:  # whole numbers have no rounding
+        distinct = len(np.unique(cloud[0], axis=0))
+        assert taken[0, :distinct].tolist() == naive_order(cloud[0], distinct, start)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_from_any_start_the_order_is_the_naive_one(dtype):
+    points = torch.from_numpy(random_cloud(40, seed=9)).to(dtype)
+    for start in range(40):
+        taken = farthest_points(points[None], 40, start)[0].tolist()
+        assert taken == naive_order(points.double().numpy(), 40, start) and sorted(taken) == list(range(40))
+
+
+def test_duplicates_come_last():
+    distinct = torch.from_numpy(random_cloud(30, seed=2))
+    points = torch.cat([distinct, distinct[:10], distinct[:5]])[None]
+    order = farthest_points(points, 45)[0].tolist()
+    places = {tuple(points[0, i].tolist()) for i in order[:30]}
+    assert len(places) == 30
+    assert order[30:] == [i for i in range(45) if i not in order[:30]]  # all of them are at distance 0
+
+
+def test_every_cloud_of_a_batch_is_sampled_alone():
+    points = torch.from_numpy(np.stack([random_cloud(90, seed) for seed in range(4)]))
+    expected = [farthest_points(cloud[None], 50, 7)[0] for cloud in points]
+    assert torch.equal(farthest_points(points, 50, 7), torch.stack(expected))
+
+
+def test_a_sample_of_more_than_all_points_repeats_each_cloud_s_own_order():
+    points = torch.from_numpy(np.stack([random_cloud(6, seed) for seed in range(3)]))
+    whole = farthest_points(points, 6)
+    assert torch.equal(farthest_points(points, 15), torch.cat([whole, whole, whole[:, :3]], 1))

@@ -122,6 +122,11 @@ class SetAbstraction(nn.Module):
 
     def __init__(self, features: int, radii: Sequence[float], mlp: Sequence[int], delayed: bool) -> None:
         super().__init__()
+        if delayed and features == 0 and len(mlp) > 1:
+            raise ValueError(
+                f"backbone: a delayed level needs features below it for its MLP {list(mlp)}; "
+                "set delayed: false, or give it one layer"
+            )
         self._delayed = delayed
         self.features = len(radii) * mlp[-1]
         if delayed:

@@ -91,14 +91,14 @@ def _octants(points: Tensor, limit: float) -> Tensor:
 def _(points: Tensor, centres: Tensor, limit: float, k: int) -> Tensor:
     from pnet.ops.cpu import neighbours as kernels
 
-    return kernels.ball_query(points.contiguous(), centres.to(points).contiguous(), limit, k)
+    return kernels.ball_query(points.contiguous(), centres.contiguous(), limit, k)
 
 
 @_nearest.register_kernel("cpu")
 def _(points: Tensor, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
     from pnet.ops.cpu import neighbours as kernels
 
-    return kernels.nearest(points.contiguous(), queries.to(points).contiguous(), k)
+    return kernels.nearest(points.contiguous(), queries.contiguous(), k)
 
 
 @_octants.register_kernel("cpu")

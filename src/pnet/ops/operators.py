@@ -67,12 +67,12 @@ def squared(radius: float, points: Tensor) -> float:
 def check_clouds(**clouds: Tensor) -> None:
     """Raise ValueError where a cloud is not (B, N, 3), has no point or is not finite; names the argument."""
     for name, cloud in clouds.items():
-        if cloud.ndim != 3 or cloud.shape[2] != 3 or cloud.shape[1] == 0:
+        if cloud.ndim != 3 or cloud.shape[2] != 3 or 0 in cloud.shape:
             raise ValueError(f"{name}: shape {tuple(cloud.shape)}, expected (B, N, 3), at least one point")
         if not cloud.is_floating_point() or cloud.element_size() < 4:
             raise ValueError(f"{name} is {cloud.dtype}, expected float32 or float64")
         if cloud.device.type == "cpu" and not bool(torch.isfinite(cloud).all()):
             raise ValueError(f"{name} has NaN or infinite coordinates")
-    if len({len(cloud) for cloud in clouds.values()}) > 1:
-        shapes = ", ".join(f"{name} {tuple(cloud.shape)}" for name, cloud in clouds.items())
-        raise ValueError(f"the clouds differ in number: {shapes}")
+    if len({(len(cloud), cloud.dtype) for cloud in clouds.values()}) > 1:
+        kinds = ", ".join(f"{name} {tuple(cloud.shape)} {cloud.dtype}" for name, cloud in clouds.items())
+        raise ValueError(f"the clouds differ in number or type: {kinds}")

@@ -16,6 +16,7 @@ NONE = torch.empty(0, 0, 0)
 
 def gather_sum(rows: Tensor, index: Tensor, weight: Tensor | None) -> Tensor:
     """See `pnet.ops.gathering`."""
+    _check(index, len(rows), rows.shape[1])
     values = _full(rows)
     out = values.new_empty(*index.shape[:2], rows.shape[2])
     arrays = values.numpy(), index.contiguous().numpy(), _weight(weight, values).numpy(), out.numpy()
@@ -25,6 +26,7 @@ def gather_sum(rows: Tensor, index: Tensor, weight: Tensor | None) -> Tensor:
 
 def scatter_sum(rows: Tensor, index: Tensor, weight: Tensor | None, n: int) -> Tensor:
     """See `pnet.ops.gathering`."""
+    _check(index, len(rows), n)
     values = _full(rows)
     out = values.new_zeros(len(rows), n, rows.shape[2])
     arrays = values.numpy(), index.contiguous().numpy(), _weight(weight, values).numpy(), out.numpy()
@@ -34,6 +36,7 @@ def scatter_sum(rows: Tensor, index: Tensor, weight: Tensor | None, n: int) -> T
 
 def gather_max(rows: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
     """See `pnet.ops.gathering`."""
+    _check(index, len(rows), rows.shape[1])
     values = _full(rows)
     out = values.new_empty(*index.shape[:2], rows.shape[2])
     winner = torch.empty(out.shape, dtype=torch.int32)
@@ -44,11 +47,21 @@ def gather_max(rows: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
 
 def scatter_max(grad: Tensor, winner: Tensor, n: int) -> Tensor:
     """See `pnet.ops.gathering`."""
+    _check(winner, len(grad), n)
     values = _full(grad)
     out = values.new_zeros(len(grad), n, grad.shape[2])
     arrays = values.numpy(), winner.contiguous().numpy(), out.numpy()
     in_parts(lambda a, b: _scatter_max(*arrays, a, b), len(grad) * _blocks(grad))
     return out.to(grad.dtype)
+
+
+def _check(index: Tensor, clouds: int, n: int) -> None:
+    """Compiled code reads where it is told: a table of another cloud must not get there."""
+    if len(index) != clouds or index.shape[2] == 0:
+        raise ValueError(f"an index of shape {tuple(index.shape)} does not fit {clouds} clouds of {n} rows")
+    low, high = index.aminmax() if index.numel() else (0, 0)
+    if low < 0 or high >= max(n, 1):
+        raise IndexError(f"index {int(low)} to {int(high)} into {n} rows: a table of another cloud?")
 
 
 def _full(rows: Tensor) -> Tensor:
