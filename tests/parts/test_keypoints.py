@@ -154,7 +154,8 @@ def test_placing_like_an_observation_keeps_free_keypoints_and_resets_finite_ones
     chain = declare("nut")
     parameters, R = sizes(chain, 40), rotations(40)
     observed, _ = chain.choose(NearestToCamera(R), chain.keypoints_from_parameters(parameters))
-    placed, canonical = chain.place_like(parameters, observed), chain.keypoints_from_parameters(parameters)
+    canonical = chain.keypoints_from_parameters(parameters)
+    placed = chain.place_like(canonical, observed)
     torch.testing.assert_close(placed[:, [0, 2]], canonical[:, [0, 2]])
     torch.testing.assert_close(placed[:, 1, :2], observed[:, 1, :2])
     torch.testing.assert_close(placed[:, 1, 2], canonical[:, 1, 2])
@@ -163,18 +164,21 @@ def test_placing_like_an_observation_keeps_free_keypoints_and_resets_finite_ones
 def test_placing_like_exact_template_keypoints_gives_them_back(chain, sizes):
     parameters = sizes(chain, 10)
     canonical = chain.keypoints_from_parameters(parameters)
-    torch.testing.assert_close(chain.place_like(parameters, canonical), canonical)
+    torch.testing.assert_close(chain.place_like(canonical, canonical), canonical)
 
 
-def test_placing_uses_the_given_parameters_not_the_observed_distances(chain, sizes):
+def test_placing_uses_the_templates_distances_not_the_observed_ones(chain, sizes):
     parameters = sizes(chain, 10)
-    placed = chain.place_like(parameters, chain.keypoints_from_parameters(1.2 * parameters))
-    torch.testing.assert_close(placed, chain.keypoints_from_parameters(parameters))
+    canonical = chain.keypoints_from_parameters(parameters)
+    placed = chain.place_like(canonical, chain.keypoints_from_parameters(1.2 * parameters))
+    torch.testing.assert_close(placed, canonical)
 
 
 def test_a_free_keypoint_observed_on_its_axis_stays_where_the_template_has_it(declare):
     observed = torch.tensor([[0, 0, -0.02], [0, 0, -0.02]], dtype=torch.float64)
-    placed = declare("flange").place_like(torch.tensor([0.01, 0.02]).double(), observed)
+    flange = declare("flange")
+    template = flange.keypoints_from_parameters(torch.tensor([0.01, 0.02]).double())
+    placed = flange.place_like(template, observed)
     assert placed.flatten().tolist() == pytest.approx([0, 0, -0.02, 0.01, 0, -0.02])
 
 

@@ -13,7 +13,8 @@ from pnet.geometry.symmetry import SphericalSymmetry, rotation_about_z
 from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointChoice, KeypointRule, NearestToPoint
 from pnet.postprocess.fit import fit_pose
-from pnet.postprocess.folded_vote import FoldedVote, fold, location, members
+from pnet.postprocess.folded_vote import FLOOR, ROUNDS, FoldedVote, _locate, fold, location, members
+from pnet.postprocess.locations import locate
 from pnet.postprocess.vote import InstanceVotes, MeanVote, PointVotes
 
 FOLDED = FoldedVote(hypotheses=96, votes=512, width=25.0, cut=3.0)
@@ -221,3 +222,39 @@ def test_scattered_votes_keep_their_median():
     values = torch.tensor([[[0.0, 1.0], [1.0, 0.0]]], dtype=torch.float64)
     centre, _ = location(values, torch.ones(1, 2, dtype=torch.bool), 0.5)
     assert centre.tolist() == [[0, 0]]
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    n=st.integers(1, 60),
+    c=st.integers(1, 4),
+    cut=st.sampled_from([0.5, 1.5, 3.0]),
+)
+def test_the_compiled_location_is_the_plain_one(seed, n, c, cut):
+    generator = torch.Generator().manual_seed(seed)
+    values = torch.randn(5, n, c, generator=generator, dtype=torch.float64)
+    values[:, ::4] *= 20
+    values[1] = values[1, :1]  # all equal
+    valid = torch.rand(5, n, generator=generator) < 0.8
+    valid[:, 0] = True
+    found, expected = (run(values, valid, cut, FLOOR, ROUNDS) for run in (locate, _locate))
+    torch.testing.assert_close(found[0], expected[0], rtol=0, atol=1e-9)
+    torch.testing.assert_close(found[1], expected[1], rtol=0, atol=1e-9)
+
+
+def test_the_folded_vote_is_the_same_for_any_number_of_threads(tn06, random_poses, random_sizes):
+    R, t = random_poses(6)
+    votes = surface_votes(tn06, random_sizes(tn06, 6), R, t, (300, 40, 90, 150, 10, 200))
+    noise = torch.randn(votes.keypoints.shape, generator=torch.Generator().manual_seed(0)).double()
+    noisy = PointVotes(votes.centroid, votes.keypoints + 0.001 * noise, votes.owner, 6, votes.reliable)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        alone = FOLDED(tn06, noisy)
+        torch.set_num_threads(3)
+        other = FOLDED(tn06, noisy)
+    finally:
+        torch.set_num_threads(before)
+    for name in ("centroid", "keypoints", "parameters", "spread"):
+        assert torch.equal(getattr(alone, name), getattr(other, name))

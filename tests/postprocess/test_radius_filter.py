@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from pnet.postprocess.radius_filter import RadiusFilter
 
@@ -48,6 +49,44 @@ def test_it_is_the_naive_loop_and_never_loses_a_cluster(seed, n, d, neighbours, 
     kept = rf(votes, labels)
     assert kept.tolist() == naive(rf, votes, labels)
     assert set(labels[kept].tolist()) == set(labels.tolist()) - {-1}
+
+
+def by_trees(rf: RadiusFilter, votes: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+    """A k-d tree for each cluster."""
+    kept = labels >= 0
+    for cluster in range(int(labels.max()) + 1):
+        members = torch.nonzero(labels == cluster).squeeze(1)
+        places, radius = votes[members].double().numpy(), rf.radius
+        while len(members):
+            near = cKDTree(places).query_ball_point(places, radius, return_length=True)
+            own = torch.from_numpy(near - 1 >= rf.neighbours)
+            radius += rf.widen
+            if float(own.double().mean()) >= rf.enough:
+                break
+            if radius > rf.max_radius + 1e-9 or rf.widen <= 0:
+                own = own if bool(own.any()) else torch.ones_like(own)
+                break
+        kept[members] = own if len(members) else kept[members]
+    return kept
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("neighbours", [20, 120])
+def test_a_full_scene_is_filtered_as_by_one_tree_a_cluster(neighbours, dtype, monkeypatch):
+    """Tight, wide and scattered clusters of 20 to 400 votes, one number unused; any number of threads."""
+    generator = torch.Generator().manual_seed(0)
+    labels = torch.repeat_interleave(torch.arange(-1, 24), 20 + 15 * torch.arange(25))
+    labels[labels == 7] = -1
+    labels = labels[torch.randperm(len(labels), generator=generator)]
+    spread = torch.tensor([0.0007, 0.006, 0.012, 0.05])[labels % 4]
+    votes = spread[:, None] * torch.randn(len(labels), 3, generator=generator)
+    votes = votes.to(dtype)
+    rf = replace(RF, neighbours=neighbours)
+    expected = by_trees(rf, votes, labels)
+    assert 0.2 < float(expected.double().mean()) < 0.95
+    for threads in (1, 3):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        assert torch.equal(rf(votes, labels), expected)
 
 
 def row(*x: float) -> torch.Tensor:

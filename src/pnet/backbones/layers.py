@@ -43,9 +43,9 @@ class Dense(nn.Module):
         """(..., before) → (..., after)."""
         if self.training:
             x = self.norm(self.linear(x))
-        else:
-            scale, shift = self.norm.folded()
-            x = F.linear(x, self.linear.weight * scale[:, None], shift)
+            return F.relu(x) if self._activate else x
+        scale, shift = self.norm.folded()
+        x = F.linear(x, self.linear.weight * scale[:, None], shift)
         return F.relu(x, inplace=True) if self._activate else x
 
 
@@ -89,13 +89,13 @@ class RelativeDense(nn.Module):
             groups = (self._side * index + place).unflatten(2, (-1, self._side))
             gathered = gather_sum(rows, groups.flatten(1, 2)).unflatten(1, groups.shape[1:3])
         if shift is None:
-            return F.relu(self.norm(gathered - centres[:, :, None]), inplace=True)
+            return F.relu(self.norm(gathered - centres[:, :, None]))
         return F.relu(gathered.add_((shift - centres)[:, :, None]), inplace=True)
 
     def largest(self, points: Tensor, features: Tensor | None, index: Tensor) -> Tensor:
         """The maximum over neighbours, before norm and ReLU (delayed aggregation): (B, M, after)."""
         rows, own = self._rows(points, features, None)
-        return F.relu(self.norm(gather_max(rows, index) - own[:, : index.shape[1]]), inplace=True)
+        return F.relu(self.norm(gather_max(rows, index) - own[:, : index.shape[1]]))
 
     def _rows(self, points: Tensor, features: Tensor | None, scale: Tensor | None) -> tuple[Tensor, Tensor]:
         """Products of every point (B, side · n, after), and what its own place adds as a centre."""

@@ -190,19 +190,32 @@ class KeypointChain:
         origin = torch.zeros_like(keypoints[..., :1, :]) if centroid is None else centroid[..., None, :]
         return keypoints - torch.cat([origin, keypoints], -2)[..., self.reference, :]
 
-    def place_like(self, parameters: Tensor, observed: Tensor) -> Tensor:
+    def place_like(self, template: Tensor, observed: Tensor) -> Tensor:
         """Template keypoints with the free ones (on circles and spheres) where an observation has them.
 
         A finite choice is undone by the part's symmetry, so the template's own stands for it; a free
         keypoint's place on its circle is known only from the observation.
 
         Args:
-            parameters: (..., k) metres.
+            template: (..., m, 3) canonical keypoints, part frame, metres; broadcast against the observed.
             observed: (..., m, 3) observed keypoints carried into the part frame, metres.
         Returns:
             (..., m, 3) metres, part frame.
         """
-        return self._replace_free(self.keypoints_from_parameters(parameters), observed)
+        places = [torch.zeros_like(template[..., 0, :])]
+        seen = self.steps(observed).unbind(-2)
+        for i, (keypoint, step) in enumerate(
+            zip(self.keypoints, self.steps(template).unbind(-2), strict=True)
+        ):
+            if keypoint.primitive.freedom is not Freedom.NONE:
+                along, radial = along_and_radial(keypoint.primitive, step)
+                towards = along_and_radial(keypoint.primitive, seen[i])[1]
+                length = torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
+                radius = torch.linalg.vector_norm(radial, dim=-1, keepdim=True)
+                turned = radius * towards / length.clamp(min=1e-12)
+                step = along + torch.where(length > 1e-9, turned, radial)
+            places.append(places[self.reference[i]] + step)
+        return torch.stack(torch.broadcast_tensors(*places[1:], observed[..., 0, :])[:-1], -2)
 
     def turn_back(self, keypoints: Tensor) -> Tensor:
         """Keypoints with the free ones turned to the template's place on their circle or sphere.
@@ -224,24 +237,6 @@ class KeypointChain:
                 length = torch.linalg.vector_norm(radial, dim=-1, keepdim=True)
                 radial = length * torch.nn.functional.normalize(template, dim=-1)
             places.append(places[self.reference[i]] + along + radial)
-        return torch.stack(places[1:], -2)
-
-    def _replace_free(self, template: Tensor, observed: Tensor) -> Tensor:
-        """The template with every free keypoint turned to the observed one's direction."""
-        template, observed = torch.broadcast_tensors(template, observed)
-        places = [torch.zeros_like(template[..., 0, :])]
-        seen = self.steps(observed).unbind(-2)
-        for i, (keypoint, step) in enumerate(
-            zip(self.keypoints, self.steps(template).unbind(-2), strict=True)
-        ):
-            if keypoint.primitive.freedom is not Freedom.NONE:
-                along, radial = along_and_radial(keypoint.primitive, step)
-                towards = along_and_radial(keypoint.primitive, seen[i])[1]
-                length = torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
-                radius = torch.linalg.vector_norm(radial, dim=-1, keepdim=True)
-                turned = radius * towards / length.clamp(min=1e-12)
-                step = along + torch.where(length > 1e-9, turned, radial)
-            places.append(places[self.reference[i]] + step)
         return torch.stack(places[1:], -2)
 
     def _candidates(self, i: int, judge: Judge, start: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:

@@ -18,25 +18,27 @@ def fit_pose(
 
     Args:
         chain: the part's keypoints.
-        parameters: (d, k), centroid: (d, 3), keypoints: (d, m, 3) camera frame, metres.
-        weight: (d, 1 + m) trust in the centroid and each keypoint, or None for equation 6's equal weights.
+        parameters: (..., k), broadcast against the others. centroid: (..., 3), keypoints: (..., m, 3) camera
+            frame, metres.
+        weight: (..., 1 + m) trust in the centroid and each keypoint, or None for equation 6's equal weights.
     Returns:
-        R (d, 3, 3), t (d, 3) part → camera, metres.
+        R (..., 3, 3), t (..., 3) part → camera, metres.
     """
-    target = torch.cat([centroid[:, None], keypoints], 1)
+    target = torch.cat([centroid[..., None, :], keypoints], -2)
     if weight is None:
         weight = torch.ones_like(target[..., 0])
-    fits = [_fit_chirality(chain, parameters, target, weight, M.to(target)) for M in chain.chiralities]
+    template = chain.keypoints_from_parameters(parameters)
+    fits = [_fit_chirality(chain, template, target, weight, M.to(target)) for M in chain.chiralities]
     R, t, error = fits[0]
     for other_R, other_t, other_error in fits[1:]:
         better = other_error < error
-        R = torch.where(better[:, None, None], other_R, R)
-        t = torch.where(better[:, None], other_t, t)
+        R = torch.where(better[..., None, None], other_R, R)
+        t = torch.where(better[..., None], other_t, t)
     return R, t
 
 
 def _fit_chirality(
-    chain: KeypointChain, parameters: Tensor, target: Tensor, weight: Tensor, mirror: Tensor
+    chain: KeypointChain, template: Tensor, target: Tensor, weight: Tensor, mirror: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Fit the template seen through `mirror`: the identity or an improper symmetry.
 
@@ -45,15 +47,15 @@ def _fit_chirality(
     the labels' geometry exactly, whatever the view.
     """
     finite = target.new_tensor([1.0, *map(float, chain.is_finite)])
-    template = _with_centroid(chain.keypoints_from_parameters(parameters)) @ mirror.mT
-    R, t = fit_rigid(template, target, weight * finite)
+    source = _with_centroid(template) @ mirror.mT
+    R, t = fit_rigid(source, target, weight * finite)
     if not all(chain.is_finite):
-        observed = apply_inverse_pose(R, t, target[:, 1:]) @ mirror
-        template = _with_centroid(chain.place_like(parameters, observed)) @ mirror.mT
-        R, t = fit_rigid(template, target, weight)
-    error = (weight * (apply_pose(R, t, template) - target).square().sum(-1)).sum(-1)
+        observed = apply_inverse_pose(R, t, target[..., 1:, :]) @ mirror
+        source = _with_centroid(chain.place_like(template, observed)) @ mirror.mT
+        R, t = fit_rigid(source, target, weight)
+    error = (weight * (apply_pose(R, t, source) - target).square().sum(-1)).sum(-1)
     return R, t, error
 
 
 def _with_centroid(keypoints: Tensor) -> Tensor:
-    return torch.cat([torch.zeros_like(keypoints[:, :1]), keypoints], 1)
+    return torch.cat([torch.zeros_like(keypoints[..., :1, :]), keypoints], -2)

@@ -21,6 +21,7 @@ from pnet.postprocess.fit import fit_pose
 from pnet.postprocess.vote import InstanceVotes, PointVotes, vote, vote_spread
 
 FLOOR = 1e-6  # metres: votes nearer to each other than this are equal
+ROUNDS = 8  # of re-weighting
 
 
 @dataclass(frozen=True)
@@ -66,14 +67,12 @@ class FoldedVote:
         """(d, 3, 3) part → camera, one of the equivalents, from the first points' own fits."""
         some = slice(0, self.hypotheses)
         centroid, keypoints, valid = centroid[:, some], keypoints[:, some], valid[:, some]
-        d, s = valid.shape
-        sizes = parameters[:, None].expand(d, s, -1).flatten(0, 1)
-        R, t = fit_pose(part.chain, sizes, centroid.flatten(0, 1), keypoints.flatten(0, 1))
-        misfit = _misfit(part.chain, sizes, R, t, keypoints.flatten(0, 1)).view(d, s)
+        parameters = parameters[:, None]
+        R, t = fit_pose(part.chain, parameters, centroid, keypoints)
+        misfit = _misfit(part.chain, part.chain.keypoints_from_parameters(parameters), R, t, keypoints)
         usual = _median(misfit, valid).clamp(min=FLOOR)
         weight = valid / (1 + (misfit / usual[:, None]).square())
-        width = self.width * torch.pi / 180
-        return mean_rotation(R.view(d, s, 3, 3), weight, part.symmetry, width)
+        return mean_rotation(R, weight, part.symmetry, self.width * torch.pi / 180)
 
 
 def fold(chain: KeypointChain, template: Tensor, local: Tensor) -> Tensor:
@@ -104,11 +103,20 @@ def location(values: Tensor, valid: Tensor, cut: float) -> tuple[Tensor, Tensor]
     Returns:
         location (d, c), and spread (d,): root mean square distance of the weighted votes.
     """
+    if values.device.type == "cpu":
+        from pnet.postprocess.locations import locate
+    else:
+        locate = _locate
+    return locate(values, valid, cut, FLOOR, ROUNDS)
+
+
+def _locate(values: Tensor, valid: Tensor, cut: float, floor: float, rounds: int) -> tuple[Tensor, Tensor]:
+    """Plain twin of `locations.locate`."""
     centre = _median(values.transpose(1, 2), valid[:, None].expand(-1, values.shape[-1], -1))
     weight = valid.to(values)
     distance = torch.linalg.vector_norm(values - centre[:, None], dim=-1)
-    for _ in range(8):
-        scale = (cut * _median(distance, valid)).clamp(min=FLOOR)
+    for _ in range(rounds):
+        scale = (cut * _median(distance, valid)).clamp(min=floor)
         weight = valid * (1 - (distance / scale[:, None]).square()).clamp(min=0).square()
         # votes so scattered that none is near: the median stands
         total = weight.sum(1, keepdim=True)
@@ -143,10 +151,10 @@ def _median(values: Tensor, valid: Tensor) -> Tensor:
     return ordered.gather(-1, middle).squeeze(-1)
 
 
-def _misfit(chain: KeypointChain, sizes: Tensor, R: Tensor, t: Tensor, keypoints: Tensor) -> Tensor:
-    """(n,) root mean square distance of votes from the template at their own pose, metres."""
+def _misfit(chain: KeypointChain, template: Tensor, R: Tensor, t: Tensor, keypoints: Tensor) -> Tensor:
+    """(...) root mean square distance of votes from the template (..., m, 3) at their own pose, metres."""
     local = apply_inverse_pose(R, t, keypoints)
     errors = [
-        chain.place_like(sizes, local @ M.to(local)) @ M.to(local).mT - local for M in chain.chiralities
+        chain.place_like(template, local @ M.to(local)) @ M.to(local).mT - local for M in chain.chiralities
     ]
-    return torch.stack([error.square().sum(-1).mean(-1).sqrt() for error in errors]).amin(0)
+    return torch.stack([error.square().sum(-1).mean(-1) for error in errors]).amin(0).sqrt()

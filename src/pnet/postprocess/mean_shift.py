@@ -1,7 +1,8 @@
 """Mean shift with a flat kernel and binned seeds (Comaniciu and Meer 2002, the paper's [22]).
 
 The same clusters as scikit-learn's `MeanShift(bin_seeding=True, cluster_all=False)`, which searches seed
-by seed: here all seeds move together, by matrix products.
+by seed: here compiled, with a k-d tree; where there is no such kernel all seeds move together, by matrix
+products.
 """
 
 import torch
@@ -21,24 +22,40 @@ def mean_shift(points: Tensor, bandwidth: float, min_seed_points: int) -> tuple[
         modes (d, 3) metres, the densest first; labels (N,) int64 of the nearest mode, −1 where that is
         farther than the bandwidth.
     """
-    centres, intensity = _climb(points, _seeds(points, bandwidth, min_seed_points), bandwidth)
-    modes = _distinct(centres, intensity, bandwidth)
-    if not len(modes):
-        return modes, torch.full((len(points),), -1, device=points.device)
-    nearest = torch.cdist(points, modes).min(1)
-    return modes, torch.where(nearest.values <= bandwidth, nearest.indices, -1)
+    seeds = _seeds(points, bandwidth, min_seed_points)
+    if not len(seeds):
+        return seeds, torch.full((len(points),), -1, device=points.device)
+    if points.device.type == "cpu":
+        from pnet.postprocess.neighbourhoods import climb, nearest_mode
+    else:
+        climb, nearest_mode = _climb, _nearest_mode
+    centres, intensity = climb(points, seeds, bandwidth, STOP * bandwidth, MAX_STEPS)
+    seen = intensity > 0
+    modes = _distinct(centres[seen], intensity[seen], bandwidth)
+    return modes, nearest_mode(points, modes, bandwidth)
 
 
 def _seeds(points: Tensor, bandwidth: float, min_seed_points: int) -> Tensor:
-    cells, count = torch.unique((points / bandwidth).round(), dim=0, return_counts=True)
-    return cells[count >= min_seed_points] * bandwidth
+    """(s, 3) middles of the grid cells that hold enough points, metres, by x, then y, then z."""
+    number: Tensor = torch.zeros_like(points[:, 0], dtype=torch.long)
+    known = []
+    for column in (points / bandwidth).round().unbind(1):  # a cell as one number: unique rows are slow
+        values, place = torch.unique(column, return_inverse=True)
+        number = number * len(values) + place
+        known.append(values)
+    cells, count = torch.unique(number, return_counts=True)
+    cells, places = cells[count >= min_seed_points], []
+    for values in reversed(known):
+        places.append(values[cells % max(len(values), 1)])
+        cells = cells // max(len(values), 1)
+    return torch.stack(places[::-1], 1) * bandwidth
 
 
-def _climb(points: Tensor, seeds: Tensor, bandwidth: float) -> tuple[Tensor, Tensor]:
-    """Move every seed to the mean of the points around it until it stays; its place and point count."""
+def _climb(points: Tensor, seeds: Tensor, bandwidth: float, stop: float, steps: int) -> tuple[Tensor, Tensor]:
+    """Plain twin of `neighbourhoods.climb`: all seeds together."""
     centres, intensity = seeds.clone(), torch.zeros(len(seeds), dtype=points.dtype, device=points.device)
     active = torch.arange(len(seeds), device=points.device)
-    for _ in range(MAX_STEPS):
+    for _ in range(steps):
         if not len(active):
             break
         within = (torch.cdist(centres[active], points) <= bandwidth).to(points.dtype)
@@ -47,8 +64,16 @@ def _climb(points: Tensor, seeds: Tensor, bandwidth: float) -> tuple[Tensor, Ten
         mean = torch.where(count[:, None] > 0, mean, centres[active])
         moved = torch.linalg.vector_norm(mean - centres[active], dim=1)
         centres[active], intensity[active] = mean, count
-        active = active[moved > STOP * bandwidth]
-    return centres[intensity > 0], intensity[intensity > 0]
+        active = active[moved > stop]
+    return centres, intensity
+
+
+def _nearest_mode(points: Tensor, modes: Tensor, bandwidth: float) -> Tensor:
+    """Plain twin of `neighbourhoods.nearest_mode`."""
+    if not len(modes):
+        return torch.full((len(points),), -1, device=points.device)
+    nearest = torch.cdist(points, modes).min(1)
+    return torch.where(nearest.values <= bandwidth, nearest.indices, -1)
 
 
 def _distinct(centres: Tensor, intensity: Tensor, bandwidth: float) -> Tensor:

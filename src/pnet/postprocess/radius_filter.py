@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 
@@ -31,22 +30,12 @@ class RadiusFilter:
         Returns:
             (N,) bool; False where the label is −1.
         """
-        kept = labels >= 0
-        for cluster in range(int(labels.max()) + 1 if len(labels) else 0):
-            members = torch.nonzero(labels == cluster).squeeze(1)
-            kept[members] = self._kept(votes[members])
-        return kept
+        from pnet.postprocess.neighbourhoods import near_enough
 
-    def _kept(self, votes: Tensor) -> Tensor:
-        places = votes.double().cpu().numpy()
-        tree, radius = cKDTree(places), self.radius
-        while True:
-            near = tree.query_ball_point(places, radius, return_length=True)
-            kept = torch.from_numpy(near - 1 >= self.neighbours).to(votes.device)
-            if float(kept.double().mean()) >= self.enough:
-                return kept
-            radius += self.widen
-            # a nanometre of slack: 0.01 + 5 · 0.002 is a little more than 0.02 in floating point
-            if radius > self.max_radius + 1e-9 or self.widen <= 0:
-                # nothing is dense enough: better all votes than an instance without any
-                return kept if bool(kept.any()) else torch.ones_like(kept)
+        order = torch.argsort(labels, stable=True)[int((labels < 0).sum()) :]
+        end = torch.bincount(labels[order]).cumsum(0).cpu()
+        widening = (self.radius, self.widen, self.max_radius)
+        near = near_enough(votes[order].double().cpu(), end, self.neighbours, self.enough, widening)
+        kept = torch.zeros_like(labels, dtype=torch.bool)
+        kept[order] = near.to(kept.device)
+        return kept

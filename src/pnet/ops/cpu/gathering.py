@@ -9,7 +9,7 @@ from torch import Tensor
 from pnet.ops.cpu.compiled import in_parts, kernel
 from pnet.ops.cpu.tree import Array
 
-BLOCK = 32  # channels that one owner adds up
+BLOCK = 16  # channels that one owner adds up, at least: a cache line of float32
 ROWS = 64  # rows that pay for a thread
 NONE = torch.empty(0, 0, 0)
 
@@ -30,7 +30,8 @@ def scatter_sum(rows: Tensor, index: Tensor, weight: Tensor | None, n: int) -> T
     values = _full(rows)
     out = values.new_zeros(len(rows), n, rows.shape[2])
     arrays = values.numpy(), index.contiguous().numpy(), _weight(weight, values).numpy(), out.numpy()
-    in_parts(lambda a, b: _scatter_sum(*arrays, a, b), len(rows) * _blocks(rows))
+    blocks = _blocks(rows)
+    in_parts(lambda a, b: _scatter_sum(*arrays, blocks, a, b), len(rows) * blocks)
     return out.to(rows.dtype)
 
 
@@ -51,7 +52,8 @@ def scatter_max(grad: Tensor, winner: Tensor, n: int) -> Tensor:
     values = _full(grad)
     out = values.new_zeros(len(grad), n, grad.shape[2])
     arrays = values.numpy(), winner.contiguous().numpy(), out.numpy()
-    in_parts(lambda a, b: _scatter_max(*arrays, a, b), len(grad) * _blocks(grad))
+    blocks = _blocks(grad)
+    in_parts(lambda a, b: _scatter_max(*arrays, blocks, a, b), len(grad) * blocks)
     return out.to(grad.dtype)
 
 
@@ -75,7 +77,8 @@ def _weight(weight: Tensor | None, values: Tensor) -> Tensor:
 
 
 def _blocks(rows: Tensor) -> int:
-    return max(1, -(-rows.shape[2] // BLOCK))
+    """Into how many blocks the channels are divided: no more than there are threads for."""
+    return max(1, min(-(-torch.get_num_threads() // len(rows)), rows.shape[2] // BLOCK)) if len(rows) else 1
 
 
 @kernel
@@ -102,12 +105,13 @@ def _gather_sum(rows: Array, index: Array, weight: Array, out: Array, start: int
 
 
 @kernel
-def _scatter_sum(rows: Array, index: Array, weight: Array, out: Array, start: int, stop: int) -> None:
+def _scatter_sum(
+    rows: Array, index: Array, weight: Array, out: Array, blocks: int, start: int, stop: int
+) -> None:
     m, k, c = index.shape[1], index.shape[2], rows.shape[2]
-    blocks = max(1, (c + BLOCK - 1) // BLOCK)
     for block in range(start, stop):
-        b, low = block // blocks, block % blocks * BLOCK
-        high = min(c, low + BLOCK)
+        b, part = block // blocks, block % blocks
+        low, high = c * part // blocks, c * (part + 1) // blocks
         for i in range(m):
             at = rows[b, i, low:high]
             for s in range(k):
@@ -144,12 +148,11 @@ def _gather_max(rows: Array, index: Array, out: Array, winner: Array, start: int
 
 
 @kernel
-def _scatter_max(grad: Array, winner: Array, out: Array, start: int, stop: int) -> None:
+def _scatter_max(grad: Array, winner: Array, out: Array, blocks: int, start: int, stop: int) -> None:
     m, c = grad.shape[1], grad.shape[2]
-    blocks = max(1, (c + BLOCK - 1) // BLOCK)
     for block in range(start, stop):
-        b, low = block // blocks, block % blocks * BLOCK
-        high = min(c, low + BLOCK)
+        b, part = block // blocks, block % blocks
+        low, high = c * part // blocks, c * (part + 1) // blocks
         for i in range(m):
             for j in range(low, high):
                 out[b, winner[b, i, j], j] += grad[b, i, j]
