@@ -24,6 +24,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from pnet.backbones.base import Backbone
 from pnet.cli.app import config_dir
+from pnet.engine.allocator import keep_freed_memory
 from pnet.models.parametricnet import ParametricNet
 from pnet.models.summary import summarise
 from pnet.ops.operators import plain_operators
@@ -57,6 +58,7 @@ def main() -> None:
     """Print the tables and the profiles, and draw the bars."""
     arguments = parse_arguments()
     torch.set_num_threads(arguments.threads)
+    keep_freed_memory()  # as pnet-train does; it serves all networks here
     torch.manual_seed(0)
     nuts = make_bin()
     sizes, repeats = (SIZES[:1], 2) if arguments.quick else (SIZES, 7)

@@ -48,13 +48,21 @@ def _fit_chirality(
     """
     finite = target.new_tensor([1.0, *map(float, chain.is_finite)])
     source = _with_centroid(template) @ mirror.mT
-    R, t = fit_rigid(source, target, weight * finite)
+    R, t = _registration(source, target, weight * finite)
     if not all(chain.is_finite):
         observed = apply_inverse_pose(R, t, target[..., 1:, :]) @ mirror
         source = _with_centroid(chain.place_like(template, observed)) @ mirror.mT
-        R, t = fit_rigid(source, target, weight)
+        R, t = _registration(source, target, weight)
     error = (weight * (apply_pose(R, t, source) - target).square().sum(-1)).sum(-1)
     return R, t, error
+
+
+def _registration(source: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    if target.device.type == "cpu" and target.dtype == torch.float64:
+        from pnet.postprocess.rigid_fits import fit_rigid_many
+
+        return fit_rigid_many(source.expand_as(target), target, weight)
+    return fit_rigid(source, target, weight)
 
 
 def _with_centroid(keypoints: Tensor) -> Tensor:
