@@ -64,6 +64,13 @@ def test_every_config_of_a_group_composes_and_builds(config: Path):
         assert build(cfg, path) is not None
 
 
+@pytest.mark.parametrize("protocol", ["paper", "demo"])
+def test_the_papers_experiment_takes_the_papers_backbone(protocol):
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        cfg = compose("train", overrides=["experiment=paper", f"protocol={protocol}"])
+    assert cfg.backbone._target_ == "pnet.backbones.pointsift.PointSIFT"
+
+
 def test_every_option_has_a_comment():
     bare = []
     for path in config_dir().rglob("*.yaml"):

@@ -1,6 +1,7 @@
 """Gathering and its reverse against loops over rows; gradients against finite differences."""
 
 import math
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -273,3 +274,16 @@ def test_nothing_is_written_outside(winner):
         OPERATORS["scatter_max"](torch.ones(1, 1, 1), torch.full((1, 1, 1), winner, dtype=torch.int32), 4)
     with pytest.raises(IndexError, match="into 4 rows"):
         OPERATORS["scatter_sum"](torch.ones(1, 1, 1), torch.full((1, 1, 1), winner), None, 4)
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_short_numbers_are_added_up_in_float32(plain):
+    rows, index = (
+        torch.full((1, 400, 1), 1.0, dtype=torch.bfloat16),
+        torch.zeros(1, 400, 1, dtype=torch.int64),
+    )
+    with plain_operators() if plain else nullcontext():
+        spread = OPERATORS["scatter_sum"](rows, index, None, 2)
+        # one by one in bfloat16 the sum would stop at 256
+        assert spread.flatten().tolist() == [400, 0] and spread.dtype == torch.bfloat16
+        assert OPERATORS["scatter_max"](rows, index.int(), 2).flatten().tolist() == [400, 0]

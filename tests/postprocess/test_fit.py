@@ -185,3 +185,11 @@ def test_a_spoilt_instance_does_not_touch_those_beside_it(any_part, random_poses
     others = [0, 1, 2, 4, 5]
     torch.testing.assert_close(together[0][others], spoilt[0][others])
     torch.testing.assert_close(together[1][others], spoilt[1][others])
+
+
+def test_a_fit_that_needs_a_gradient_has_one(any_part, random_poses, random_sizes):
+    R, t = random_poses(4)
+    sizes = random_sizes(any_part, 4)
+    keypoints = apply_pose(R, t, any_part.chain.keypoints_from_parameters(sizes)).requires_grad_()
+    fit_pose(any_part.chain, sizes, t, keypoints)[1].sum().backward()
+    assert bool(torch.isfinite(keypoints.grad).all())

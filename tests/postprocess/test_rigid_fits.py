@@ -81,3 +81,9 @@ def test_threads_do_not_change_the_fits():
         found.append(fit_rigid_many(source, target, weight))
     torch.set_num_threads(threads)
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+def test_nothing_that_counts_gives_a_finite_fit():
+    source, weight, _, _ = clouds(3, 4)
+    found_R, found_t = fit_rigid_many(source, source, 0 * weight)
+    assert torch.equal(found_R, torch.eye(3).double().expand(3, 3, 3)) and not bool(found_t.any())

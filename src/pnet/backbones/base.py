@@ -19,7 +19,7 @@ class Backbone(nn.Module, ABC):
     pyramid: Pyramid | None = None
 
     def tables(self, points: Tensor) -> Tables:
-        """Neighbour tables of clouds; found once, outside autograd.
+        """Neighbour tables of clouds; found once, outside autograd. One that overrides this has no `pyramid`.
 
         Args:
             points: (B, N, 3) metres, camera frame, in farthest-point-sampling order.

@@ -117,7 +117,7 @@ class SetAbstraction(nn.Module):
     Args:
         features: C of the level below. radii: of the scales, metres. mlp: channels, the same for each scale.
         delayed: the MLP runs per point and the maximum is taken before its last norm and ReLU (ASSANet's
-            order): a factor k less work.
+            order): n rows instead of M k for M centres with k neighbours.
     """
 
     def __init__(self, features: int, radii: Sequence[float], mlp: Sequence[int], delayed: bool) -> None:

@@ -22,7 +22,7 @@ class Level:
     """
 
     points: int
-    radius: float | Sequence[float]
+    radius: float | Sequence[float]  # as a union not for hydra.utils.instantiate; pnet's own takes it
     neighbours: int
     mlp: Sequence[int]
     delayed: bool = False

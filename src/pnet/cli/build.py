@@ -136,7 +136,12 @@ def load_estimator(run: Path) -> tuple[DictConfig, "NetworkEstimator"]:
             if name.startswith(prefix)
         }
         parts.network.load_state_dict(weights)
-    except (RuntimeError, ValueError, OmegaConfBaseException) as fault:
+    except RuntimeError as fault:  # names or shapes of weights
+        raise ValueError(
+            f"{checkpoint}: its weights do not fit the network that this version of pnet builds, train again "
+            f"({str(fault).splitlines()[0]})"
+        ) from fault
+    except (ValueError, OmegaConfBaseException) as fault:
         raise ValueError(f"{checkpoint}: {fault}") from fault
     network = parts.network.to(device_of(cfg.trainer.accelerator)).eval()
     bf16 = use_bf16(cfg.trainer.precision, cfg.trainer.accelerator)

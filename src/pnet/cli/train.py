@@ -25,7 +25,7 @@ def train(cfg: DictConfig) -> None:
     import torch
 
     quiet_lightning()
-    from pnet.cli.build import CONFIG, RESOLVED, build_data, build_parts, identity, use_bf16
+    from pnet.cli.build import CONFIG, RESOLVED, build_data, build_parts, device_of, identity, use_bf16
     from pnet.cli.instantiate import instantiate
     from pnet.engine.allocator import keep_freed_memory
     from pnet.engine.callbacks import PoseValidation, Throughput
@@ -39,7 +39,8 @@ def train(cfg: DictConfig) -> None:
 
     if cfg.trainer.threads is not None:
         torch.set_num_threads(cfg.trainer.threads)
-    keep_freed_memory()
+    if device_of(cfg.trainer.accelerator) == "cpu":
+        keep_freed_memory()
     run = Path(cfg.run_dir)
     checkpoint = resume_from(cfg.ckpt, run / "checkpoints" / NAME)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)

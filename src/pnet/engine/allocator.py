@@ -11,7 +11,7 @@ def keep_freed_memory() -> bool:
 
     A training step on a CPU allocates the same large tensors again and again; glibc asks the system for each
     of them anew, and every page is filled with zeros before its first use. The price is that the process
-    holds its peak.
+    holds its peak, and that its heap may get holes.
 
     Returns:
         whether it was done: on Linux with glibc only.

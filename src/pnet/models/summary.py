@@ -30,7 +30,7 @@ class NetworkSummary:
         return (
             f"{self.backbone}: {self.parameters / 1e6:.2f} M parameters; a scene of {self.points} points "
             f"takes {self.operations / 1e9:.2f} G multiply-adds forward and keeps "
-            f"{self.kept_bytes / 2**20:.0f} MiB for the backward pass"
+            f"{self.kept_bytes / 2**20:.0f} MiB in float32 for the backward pass"
         )
 
 

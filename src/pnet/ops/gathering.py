@@ -1,8 +1,8 @@
 """Gathering rows of features by a table of indices, with backward; for every cloud of a batch.
 
 A linear layer commutes with gathering: W [f_j; x_j − x_i] = (W_f f_j + W_x x_j) − W_x x_i. So backbones apply
-it per point first, gather its rows and subtract the centre's: a factor k less work for k neighbours. With
-two neighbours side by side W [f_a; f_b] = W_a f_a + W_b f_b is `gather_sum` over two rows.
+it per point first, gather its rows and subtract the centre's: n products, not M k for M centres of k
+neighbours. With two neighbours side by side W [f_a; f_b] = W_a f_a + W_b f_b is `gather_sum` over two rows.
 """
 
 from typing import Any
@@ -51,18 +51,18 @@ def gather_max(rows: Tensor, index: Tensor) -> Tensor:
 
 @operator
 def _gather_sum(rows: Tensor, index: Tensor, weight: Tensor | None) -> Tensor:
-    taken = _gathered(rows, index)
-    return (taken if weight is None else taken * weight[..., None].to(taken)).sum(2)
+    taken = _gathered(rows, index).to(_precise(rows))
+    return (taken if weight is None else taken * weight[..., None].to(taken)).sum(2).to(rows)
 
 
 @operator
 def _scatter_sum(rows: Tensor, index: Tensor, weight: Tensor | None, n: int) -> Tensor:
     """The reverse of `_gather_sum`: (B, M, C) → (B, n, C)."""
-    spread = rows[:, :, None].expand(*index.shape, rows.shape[2])
+    spread = rows[:, :, None].expand(*index.shape, rows.shape[2]).to(_precise(rows))
     if weight is not None:
-        spread = spread * weight[..., None].to(rows)
-    out = rows.new_zeros(len(rows), n, rows.shape[2])
-    return out.scatter_add(1, _wide(index, rows.shape[2]), spread.flatten(1, 2))
+        spread = spread * weight[..., None].to(spread)
+    out = spread.new_zeros(len(rows), n, rows.shape[2])
+    return out.scatter_add(1, _wide(index, rows.shape[2]), spread.flatten(1, 2)).to(rows)
 
 
 @operator
@@ -79,7 +79,8 @@ def _gather_max(rows: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
 @operator
 def _scatter_max(grad: Tensor, winner: Tensor, n: int) -> Tensor:
     """The reverse of `_gather_max`: (B, M, C) → (B, n, C)."""
-    return grad.new_zeros(len(grad), n, grad.shape[2]).scatter_add(1, winner.long(), grad)
+    out = grad.new_zeros(len(grad), n, grad.shape[2], dtype=_precise(grad))
+    return out.scatter_add(1, winner.long(), grad.to(out)).to(grad)
 
 
 @_gather_sum.register_kernel("cpu")
@@ -168,6 +169,11 @@ _gather_max.register_autograd(_max_backward, setup_context=_keep_max)
 def _gathered(rows: Tensor, index: Tensor) -> Tensor:
     """(B, n, C), (B, M, k) → (B, M, k, C)."""
     return torch.gather(rows, 1, _wide(index, rows.shape[2])).view(*index.shape, rows.shape[2])
+
+
+def _precise(rows: Tensor) -> torch.dtype:
+    """Sums of short numbers are taken in float32."""
+    return torch.promote_types(rows.dtype, torch.float32)
 
 
 def _wide(index: Tensor, channels: int) -> Tensor:

@@ -40,13 +40,13 @@ def nearest(points: Tensor, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
 
 def three_nearest(points: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-    """The three nearest known points of every point, and their inverse-distance weights (PointNet++).
+    """The three nearest known points of every point, with inverse squared distances as weights (PointNet++).
 
     Args:
         points: (B, N, 3), known: (B, M, 3) metres, M >= 1.
     Returns:
         index (B, N, 3) int64 into known and weight (B, N, 3), each row summing to 1; with M < 3 fewer
-        columns.
+        columns. A point on a known one (nearer than some 10 µm) takes it alone.
     """
     index, square = nearest(known, points, min(3, known.shape[1]))
     weight = 1 / (square + 1e-10)

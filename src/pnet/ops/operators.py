@@ -43,7 +43,7 @@ def operator(reference: Callable[..., object]) -> Operator:
 
 @contextmanager
 def plain_operators() -> Iterator[None]:
-    """Run the references instead of the kernels: for comparison, and where a kernel is at fault."""
+    """Run the references instead of the kernels, in this whole process: to compare, or to find a fault."""
     with ExitStack() as stack:
         for made in OPERATORS.values():
             for device in DEVICES:
@@ -65,7 +65,7 @@ def squared(radius: float, points: Tensor) -> float:
 
 
 def check_clouds(**clouds: Tensor) -> None:
-    """Raise ValueError where a cloud is not (B, N, 3), has no point or is not finite; names the argument."""
+    """Raise ValueError where a cloud is not (B, N, 3), has no point or (on a CPU) is not finite; names it."""
     for name, cloud in clouds.items():
         if cloud.ndim != 3 or cloud.shape[2] != 3 or 0 in cloud.shape:
             raise ValueError(f"{name}: shape {tuple(cloud.shape)}, expected (B, N, 3), at least one point")

@@ -58,7 +58,8 @@ def _fit_chirality(
 
 
 def _registration(source: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    if target.device.type == "cpu" and target.dtype == torch.float64:
+    plain = source.requires_grad or target.requires_grad or weight.requires_grad
+    if target.device.type == "cpu" and target.dtype == torch.float64 and not plain:
         from pnet.postprocess.rigid_fits import fit_rigid_many
 
         return fit_rigid_many(source.expand_as(target), target, weight)

@@ -41,8 +41,8 @@ def _fit(source: Array, target: Array, weight: Array, R: Array, t: Array, start:
                 a[k] += w * source[row, i, k]
                 b[k] += w * target[row, i, k]
         for k in range(3):
-            a[k] /= total
-            b[k] /= total
+            a[k] /= max(total, 1e-300)  # nothing counts: any rotation fits
+            b[k] /= max(total, 1e-300)
         for i in range(source.shape[1]):
             for j in range(3):
                 for k in range(3):
