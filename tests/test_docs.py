@@ -1,9 +1,11 @@
 """The tutorial's files are what a reader would type: they must work."""
 
 import re
+import runpy
 from pathlib import Path
 
 import pytest
+import torch
 import trimesh
 from omegaconf import OmegaConf
 
@@ -32,6 +34,31 @@ def tutorial(tmp_path, monkeypatch) -> Path:
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv(TRUSTED, "my_parts")
     return tmp_path
+
+
+@pytest.fixture
+def backbones(tmp_path, monkeypatch) -> Path:
+    for name, content in blocks("backbones.md").items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(content, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv(TRUSTED, "my_backbones")
+    return tmp_path
+
+
+def test_the_page_on_backbones_holds_what_it_says(backbones):
+    runpy.run_path(str(backbones / "compare.py"))
+    net = instantiate(OmegaConf.load(backbones / "my_conf" / "backbone" / "patches.yaml"))
+    points = 0.1 * torch.rand(2, 50, 3)
+    assert net(points, net.tables(points)).shape == (2, 50, net.features)
+    assert net.tables(points)["ball_1_0"].shape == (2, 50, 16)
+
+
+def test_the_page_on_backbones_names_every_config():
+    text = (ROOT / "docs" / "backbones.md").read_text(encoding="utf-8")
+    configs = {path.stem for path in (ROOT / "conf" / "backbone").glob("*.yaml")}
+    assert {name for name in re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)} >= configs
 
 
 @pytest.mark.parametrize("name", ["bolt", "pin", "bracket"])
