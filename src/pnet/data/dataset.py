@@ -17,9 +17,7 @@ from pnet.parts.keypoints import KeypointChain
 from pnet.records import Batch, Scene
 
 Draw = tuple[int, int]  # scene index and epoch: all that chance depends on, besides the seed
-
-
-Item = dict[str, Tensor | Tables]
+Item = dict[str, Tensor | Tables]  # what a scene gives a batch, by name
 
 
 class LabelledScenes(Dataset[Item]):
