@@ -76,7 +76,8 @@ def train(cfg: DictConfig) -> None:
     write_atomically(run / RESOLVED, OmegaConf.to_yaml(cfg, resolve=True).encode())
     write_json(run / "provenance.json", provenance(cfg.seed))
     (run / "metrics.json").unlink(missing_ok=True)
-    summary = summarise(parts.network, torch.from_numpy(validation[0].points[: cfg.data.points]))
+    full = validation[len(validation) - 1]  # cycles end with a full bin
+    summary = summarise(parts.network, torch.from_numpy(full.points[: cfg.data.points]))
     print(summary)
     try:
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
