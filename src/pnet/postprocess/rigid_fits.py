@@ -84,7 +84,7 @@ def _diagonalise(K: Array, V: Array) -> None:
             inside += K[i, i] * K[i, i]
             for j in range(i):
                 outside += K[i, j] * K[i, j]
-        if outside <= 1e-34 * inside:
+        if outside <= 1e-29 * inside:  # rounding leaves some 1e-31
             return
         for p in range(3):
             for q in range(p + 1, 4):
