@@ -5,11 +5,10 @@ python benchmarks/bench_labels.py
 
 import platform
 from collections.abc import Callable
-from statistics import median
-from time import perf_counter
 
 import numpy as np
 import torch
+from nut_bin import clock as timing
 from omegaconf import OmegaConf
 
 from pnet.cli.app import config_dir
@@ -44,6 +43,10 @@ def main() -> None:
 
 def times(part: ParametricPart) -> list[float]:
     """Milliseconds a scene: camera rule, amortised, plain loop, point rule, mean vote, folded vote."""
+
+    def clock(run: Callable[[], object]) -> float:
+        return timing(run, REPEATS).ms
+
     choice = KeypointChoice()
     many_sizes, many_R, _ = random_instances(part, SCENES * INSTANCES, seed=0)
     sizes, R, t = random_instances(part, INSTANCES, seed=1)
@@ -78,17 +81,6 @@ def surface_points(part: ParametricPart, sizes: torch.Tensor, owner: torch.Tenso
     sample = torch.from_numpy(np.asarray(mesh.sample(len(owner), seed=0)))
     reach = torch.linalg.vector_norm(part.chain.keypoints_from_parameters(sizes), dim=-1).amax(-1)
     return sample * (reach / reach.min())[owner, None]
-
-
-def clock(run: Callable[[], object]) -> float:
-    """Median milliseconds of a call, after one to warm up."""
-    run()
-    spent = []
-    for _ in range(REPEATS):
-        start = perf_counter()
-        run()
-        spent.append(perf_counter() - start)
-    return 1000 * median(spent)
 
 
 if __name__ == "__main__":

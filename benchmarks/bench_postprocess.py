@@ -7,12 +7,11 @@ python benchmarks/bench_postprocess.py
 import argparse
 import platform
 from collections.abc import Callable
-from statistics import median
-from time import perf_counter
 
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
+from nut_bin import clock as timing
 from omegaconf import OmegaConf
 from scipy.spatial.transform import Rotation
 from sklearn.cluster import MeanShift
@@ -72,7 +71,7 @@ def times(part: ParametricPart, recovery: PoseRecovery, repeats: int) -> list[fl
     """Milliseconds of every column, and the number of instances found."""
 
     def clock(run: Callable[[], object]) -> float:
-        return median_time(run, repeats)
+        return timing(run, repeats).ms
 
     prediction = predict(part, by_point=not recovery.voting.filters_keypoints)
     centroids, keypoints = prediction.centroid[0].double(), prediction.keypoints[0].double()
@@ -83,7 +82,7 @@ def times(part: ParametricPart, recovery: PoseRecovery, repeats: int) -> list[fl
     target = agreed.parameters, agreed.centroid, agreed.keypoints
     return [
         clock(lambda: recovery.cluster(centroids)),
-        median_time(lambda: scikit_clusters(recovery.cluster, centroids), 1),
+        timing(lambda: scikit_clusters(recovery.cluster, centroids), 1).ms,
         clock(lambda: recovery._reliable(centroids, keypoints, labels)),
         clock(lambda: recovery.voting(part, votes)),
         clock(lambda: fit_pose(part.chain, *target)),
@@ -146,17 +145,6 @@ def scikit_clusters(cluster: CentroidClusters, centroids: Tensor) -> object:
         min_bin_freq=cluster.min_seed_points,
         cluster_all=False,
     ).fit(centroids.numpy())
-
-
-def median_time(run: Callable[[], object], repeats: int) -> float:
-    """Median milliseconds of a call, after one to warm up."""
-    run()
-    spent = []
-    for _ in range(repeats):
-        start = perf_counter()
-        run()
-        spent.append(perf_counter() - start)
-    return 1000 * median(spent)
 
 
 if __name__ == "__main__":

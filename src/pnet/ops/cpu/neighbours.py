@@ -131,13 +131,7 @@ def _nearest(tree: Tree, queries: Array, index: Array, square: Array, start: int
             if gap > d[k - 1] or (gap == d[k - 1] and tree.first[node] > best[k - 1]):
                 continue
             if node < inner:
-                left, right = 2 * node + 1, 2 * node + 2
-                to_left = box_distance(tree.low, tree.high, left, x, y, z)
-                to_right = box_distance(tree.low, tree.high, right, x, y, z)
-                if to_left <= to_right:
-                    left, right = right, left
-                stack[top], stack[top + 1] = left, right  # the nearer one is next
-                top += 2
+                top = _open_nearer_last(tree, node, x, y, z, stack, top)
                 continue
             for p in range(tree.start[node], tree.stop[node]):
                 place = tree.place[p]
@@ -171,13 +165,7 @@ def _octants(tree: Tree, limit: float, found: Array, start: int, stop: int) -> N
             if not _serves(tree.low, tree.high, node, x, y, z, best):
                 continue
             if node < inner:
-                left, right = 2 * node + 1, 2 * node + 2
-                to_left = box_distance(tree.low, tree.high, left, x, y, z)
-                to_right = box_distance(tree.low, tree.high, right, x, y, z)
-                if to_left <= to_right:
-                    left, right = right, left
-                stack[top], stack[top + 1] = left, right
-                top += 2
+                top = _open_nearer_last(tree, node, x, y, z, stack, top)
                 continue
             for p in range(tree.start[node], tree.stop[node]):
                 place = tree.place[p]
@@ -188,6 +176,18 @@ def _octants(tree: Tree, limit: float, found: Array, start: int, stop: int) -> N
                     best[o], who[o] = value, i
         for o in range(8):
             found[me, o] = who[o] if who[o] < n else me
+
+
+@kernel
+def _open_nearer_last(tree: Tree, node: int, x: float, y: float, z: float, stack: Array, top: int) -> int:
+    """Put a node's children on the stack, the nearer one on top; the stack's new height."""
+    left, right = 2 * node + 1, 2 * node + 2
+    to_left = box_distance(tree.low, tree.high, left, x, y, z)
+    to_right = box_distance(tree.low, tree.high, right, x, y, z)
+    if to_left <= to_right:
+        left, right = right, left
+    stack[top], stack[top + 1] = left, right
+    return top + 2
 
 
 @kernel
