@@ -77,6 +77,9 @@ class Batch:
         visibility: (B, N) label: its visibility.
         scene: (B,) index of each scene in the data set.
         tables: the backbone's neighbour tables of the points, or None where it finds them itself.
+        rotation: (B, N, 3, 3) label: rotation of the instance, part → camera; None where no method asks.
+        scale: (B, 3, 3) Λ of each scene's part object in the part frame, metres (λ times the identity for a
+            revolution), by which rotations are compared; None likewise.
     """
 
     points: Tensor
@@ -87,6 +90,8 @@ class Batch:
     visibility: Tensor
     scene: Tensor
     tables: dict[str, Tensor] | None = None
+    rotation: Tensor | None = None
+    scale: Tensor | None = None
 
     def pin_memory(self) -> "Batch":
         """A copy in page-locked memory, for asynchronous transfer; the loader calls it."""
@@ -100,8 +105,23 @@ class Batch:
 
 
 @dataclass(frozen=True, eq=False)
+class PosePrediction:
+    """What PPR-Net says of every point.
+
+    Attributes:
+        centroid: (B, N, 3) metres, camera frame.
+        rotation: (B, N, 3, 3) part → camera, one of the equivalents.
+        visibility: (B, N) in [0, 1], or None without that head.
+    """
+
+    centroid: Tensor
+    rotation: Tensor
+    visibility: Tensor | None
+
+
+@dataclass(frozen=True, eq=False)
 class PointPrediction:
-    """What a network says of every point.
+    """What ParametricNet says of every point.
 
     Attributes:
         centroid: (B, N, 3) metres, camera frame.
@@ -120,9 +140,9 @@ class Detections:
 
     Attributes:
         R: (d, 3, 3), t: (d, 3) part → camera, metres.
-        parameters: (d, k) metres.
+        parameters: (d, k) metres; NaN where the method knows nothing of them.
         score: (d,) higher is surer.
-        keypoints: (d, m, 3) voted keypoints, camera frame, metres.
+        keypoints: (d, m, 3) voted keypoints, camera frame, metres; NaN where the method has none.
         instance: (N,) int64 index of the detection that each point was clustered to, −1 for none.
     """
 

@@ -114,7 +114,7 @@ def test_tensorboard_holds_what_is_watched(smoke):
         assert {
             f"{stage}_loss/{term}" for term in ("centroid", "keypoints", "parameters", "visibility")
         } <= scalars
-    assert {"val/AP", "val/MAP", "val/mAP", "val/F1", "final/AP", "train/scenes_per_second"} <= scalars
+    assert {"val/AP", "val/MAP", "val/mAP", "val/F1", "final/AP_val", "train/scenes_per_second"} <= scalars
     assert any(name.startswith("lr") for name in scalars)
     assert "val/precision_recall" in tags["images"]
     assert any(name.startswith("val/points") for name in tags["tensors"])  # the mesh plugin's
@@ -421,7 +421,7 @@ def test_ctrl_c_in_generation_and_the_same_command_goes_on(smoke, start, run_her
     process = start(tmp_path, *command)
     wait_for(lambda: any(tmp_path.rglob("pile*.safetensors")), process)
     code, lines = interrupt(process)
-    assert code == 130 and len(lines) == 1 and lines[0].startswith("interrupted")
+    assert (code, len(lines)) == (130, 1) and lines[0].startswith("interrupted"), (code, lines)
     data = tmp_path / "outputs" / "data" / "tn34_smoke"
     assert not left_overs(tmp_path)
     outcome = run_here(tmp_path, "generate", *making(), "workers=0")
@@ -435,7 +435,7 @@ def test_ctrl_c_in_training_and_going_on_gives_the_same_weights(smoke, start, ru
     process = start(tmp_path, "train", *cut)
     wait_for((tmp_path / "cut" / "checkpoints" / "last.ckpt").exists, process)
     code, lines = interrupt(process)
-    assert code == 130 and len(lines) == 1 and lines[0].startswith("interrupted")
+    assert (code, len(lines)) == (130, 1) and lines[0].startswith("interrupted"), (code, lines)
     assert not left_overs(tmp_path)
     assert not (tmp_path / "cut" / "metrics.json").exists()
     reached = read_checkpoint(tmp_path / "cut" / "checkpoints" / "last.ckpt")["global_step"]

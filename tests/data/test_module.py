@@ -33,8 +33,8 @@ def order(data, epochs):
 
 def test_shapes_of_a_batch(root, tn06):
     batch = next(iter(module(root, tn06, points=100).train_dataloader()))
-    assert batch.tables is None
-    shapes = {name: tuple(value.shape) for name, value in vars(batch).items() if name != "tables"}
+    assert batch.tables is None and batch.rotation is None and batch.scale is None
+    shapes = {name: tuple(value.shape) for name, value in vars(batch).items() if value is not None}
     assert shapes == {
         "points": (4, 100, 3),
         "centroid": (4, 100, 3),

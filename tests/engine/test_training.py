@@ -71,7 +71,7 @@ def fit(
     lightning.seed_everything(seed, verbose=False)
     network = ParametricNet(backbone(), 3, [8], [8], 0.02, True)
     optimizer = partial(torch.optim.AdamW, lr=0.003)
-    schedule, loss = WarmupCosine(0.1, 0.01), ParametricLoss(part.chain, "each")
+    schedule, loss = WarmupCosine(0.1, 0.01), ParametricLoss(part, "each")
     module = PoseTraining(network, loss, optimizer, schedule, False, {"backbone": identity})
     data = SceneDataModule(
         part, root, Targets(rule), Augmentation(True, 1e-4), None, 2, 2 * EPOCH_STEPS, 1, 0, seed

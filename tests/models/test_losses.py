@@ -78,7 +78,7 @@ def naive_losses(part, norm: str, predicted: PointPrediction, batch: Batch) -> d
 @pytest.mark.parametrize("norm", NORMS)
 def test_losses_are_those_of_the_naive_loop(part, batch, norm):
     predicted = noisy(batch)
-    losses = ParametricLoss(part.chain, norm)(predicted, batch)
+    losses = ParametricLoss(part, norm)(predicted, batch)
     expected = naive_losses(part, norm, predicted, batch)
     assert {name: float(losses[name]) for name in expected} == pytest.approx(expected, rel=1e-4)
     m, k = len(part.chain), part.k
@@ -92,29 +92,29 @@ def test_losses_are_those_of_the_naive_loop(part, batch, norm):
 
 
 def test_default_weights_are_the_papers(tn34, tn06):
-    weights = ParametricLoss(tn34.chain, "squared").weights
+    weights = ParametricLoss(tn34, "squared").weights
     assert weights == pytest.approx(
         {"centroid": 200, "keypoints": 200 / 9, "parameters": 25, "visibility": 50}
     )
-    assert ParametricLoss(tn06.chain, "squared").weights["parameters"] == pytest.approx(50 / 3)
+    assert ParametricLoss(tn06, "squared").weights["parameters"] == pytest.approx(50 / 3)
 
 
 def test_given_weights_replace_them_zero_too(tn34, make_scene, batch):
-    loss = ParametricLoss(tn34.chain, "squared", centroid=0.0, keypoints=7.0)
+    loss = ParametricLoss(tn34, "squared", centroid=0.0, keypoints=7.0)
     assert loss.weights == pytest.approx({"centroid": 0, "keypoints": 7, "parameters": 25, "visibility": 50})
 
 
 @pytest.mark.parametrize("norm", NORMS)
 def test_a_perfect_prediction_has_no_loss_and_a_finite_gradient(part, batch, norm):
     predicted = replace(perfect(batch), keypoints=batch.keypoints.clone().requires_grad_())
-    losses = ParametricLoss(part.chain, norm)(predicted, batch)
+    losses = ParametricLoss(part, norm)(predicted, batch)
     assert losses["loss"].item() == pytest.approx(0, abs=2e-5)
     losses["loss"].backward()
     assert bool(predicted.keypoints.grad.isfinite().all())
 
 
 def test_without_the_visibility_module_its_term_is_missing(part, batch):
-    loss = ParametricLoss(part.chain, "squared")
+    loss = ParametricLoss(part, "squared")
     full, without = loss(noisy(batch), batch), loss(replace(noisy(batch), visibility=None), batch)
     assert "visibility" not in without
     assert float(full["loss"] - without["loss"]) == pytest.approx(50 * float(full["visibility"]), rel=1e-4)
@@ -127,7 +127,7 @@ def test_by_hand(tn34):
     predicted = replace(
         shifted, centroid=batch.centroid + torch.tensor([0, 2.0, 0]), visibility=torch.full((1, 1), 0.25)
     )
-    values = {norm: ParametricLoss(tn34.chain, norm)(predicted, batch) for norm in NORMS}
+    values = {norm: ParametricLoss(tn34, norm)(predicted, batch) for norm in NORMS}
     assert [float(values[n]["centroid"]) for n in ("squared", "distance", "each")] == pytest.approx([4, 2, 2])
     assert [float(values[n]["keypoints"]) for n in ("squared", "distance", "each")] == pytest.approx(
         [25, 5, 7]
@@ -149,7 +149,7 @@ def test_a_label_counts_by_its_margin_over_margin_and_scale(tn34, margin, trust)
     """Scale 2 mm, errors 3, 4 and 12. `squared` weighs squares, the others distances."""
     batch = point(margin)
     predicted = moved(batch, [[3.0, 0, 0], [0, 4, 0], [0, 0, 12]])
-    found = {n: float(ParametricLoss(tn34.chain, n, 0.002)(predicted, batch)["keypoints"]) for n in NORMS}
+    found = {n: float(ParametricLoss(tn34, n, 0.002)(predicted, batch)["keypoints"]) for n in NORMS}
     squares = sum(w * e * e for w, e in zip(trust, (3, 4, 12), strict=True))
     scaled = math.hypot(*(w * e for w, e in zip(trust, (3, 4, 12), strict=True)))
     distances = sum(w * e for w, e in zip(trust, (3, 4, 12), strict=True))
@@ -161,7 +161,7 @@ def test_a_label_counts_by_its_margin_over_margin_and_scale(tn34, margin, trust)
 @pytest.mark.parametrize("norm", NORMS)
 def test_a_margin_touches_the_keypoints_loss_only(part, batch, norm):
     predicted = noisy(batch)
-    plain, weighed = ParametricLoss(part.chain, norm), ParametricLoss(part.chain, norm, margin=0.002)
+    plain, weighed = ParametricLoss(part, norm), ParametricLoss(part, norm, margin=0.002)
     one, other = plain(predicted, batch), weighed(predicted, batch)
     for name in ("centroid", "parameters", "visibility"):
         assert torch.equal(one[name], other[name])
@@ -177,7 +177,7 @@ def test_gradients_are_finite_whatever_margin_and_error(tn34, norm, margin, erro
     batch = point(margin)
     keypoints = (batch.keypoints + error).requires_grad_()
     predicted = PointPrediction(batch.centroid, keypoints, batch.visibility)
-    loss = ParametricLoss(tn34.chain, norm, 0.002)(predicted, batch)["keypoints"]
+    loss = ParametricLoss(tn34, norm, 0.002)(predicted, batch)["keypoints"]
     loss.backward()
     assert math.isfinite(loss.item()) and bool(keypoints.grad.isfinite().all())
     gradient = keypoints.grad[0, 0].norm(dim=-1)
@@ -191,16 +191,18 @@ def test_gradients_are_finite_whatever_margin_and_error(tn34, norm, margin, erro
 @pytest.mark.parametrize("margin", [0.0, -0.001])
 def test_a_margin_that_is_no_length_is_refused(tn34, margin):
     with pytest.raises(ValueError, match=r"loss\.margin is .*, expected a positive length in metres or null"):
-        ParametricLoss(tn34.chain, "each", margin=margin)
+        ParametricLoss(tn34, "each", margin=margin)
 
 
 def test_ambiguity_is_the_share_of_labels_with_a_near_runner_up(tn34):
     rows = [[INF, 0.0, 0.0005], [INF, 0.002, 0.0009], [INF, INF, 0.0011], [INF, 0.003, 0.0]]
     batch = replace(point([INF] * 3), margin=torch.tensor([rows[:2], rows[2:]]))
-    share = ParametricLoss(tn34.chain, "squared").ambiguity(batch)
-    assert {name: float(value) for name, value in share.items()} == {"base": 0, "top": 0.25, "rim": 0.75}
+    share = ParametricLoss(tn34, "squared").remarks(batch)
+    assert {name: float(value) for name, value in share.items()} == {
+        f"ambiguous_labels/{name}": value for name, value in {"base": 0, "top": 0.25, "rim": 0.75}.items()
+    }
 
 
 def test_an_unknown_norm_is_refused(tn34):
     with pytest.raises(ValueError, match="cubic"):
-        ParametricLoss(tn34.chain, "cubic")
+        ParametricLoss(tn34, "cubic")

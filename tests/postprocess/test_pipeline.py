@@ -145,7 +145,7 @@ def test_without_visibility_the_score_is_the_share_of_points(tn34, make_scene):
     whole = predict(scene, tn34, visibility=False)
     prediction = PointPrediction(whole.centroid[:, keep], whole.keypoints[:, keep], None)
     found = recover(tn34, scene, prediction)
-    assert found.score.tolist() == [1.0, 0.5, 0.25]
+    assert found.score.tolist() == [200 / 350, 100 / 350, 50 / 350]
     assert paired(tn34, scene, found)[1].tolist() == [0, 1, 2]
 
 

@@ -33,7 +33,7 @@ pytestmark = pytest.mark.usefixtures("bullet")
 
 @pytest.fixture
 def tasks(factory) -> list[CycleTask]:
-    return factory.protocol.tasks({"L": 16})
+    return factory.protocol.tasks({"L": range(16)})
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def reference(factory, tmp_path_factory) -> dict[str, bytes]:
     """What the tiny data set's files hold, made in this process, in order."""
     folder = tmp_path_factory.mktemp("reference")
     open_root(folder, SETTINGS)
-    list(generate(factory, folder, factory.protocol.tasks({"L": 16}), workers=0))
+    list(generate(factory, folder, factory.protocol.tasks({"L": range(16)}), workers=0))
     return contents(folder)
 
 

@@ -26,7 +26,7 @@ def config(name: str) -> Protocol:
 def test_the_paper_has_29_cycles_to_learn_from_and_one_for_each_test(objects):
     """Table I: 64 part objects of TN06, 16 of TN34, 60 drops, 29 + 1 + 1 cycles."""
     plan = config("paper")
-    tasks = plan.tasks({"L": objects, "G": objects})
+    tasks = plan.tasks({"L": range(objects), "G": range(objects)})
     counts = {split: sum(t.split == split for t in tasks) for split in plan.splits}
     assert counts["train"] + counts["val"] == 29 * objects
     assert counts["test_l"] == counts["test_g"] == objects
@@ -38,12 +38,12 @@ def test_the_paper_has_29_cycles_to_learn_from_and_one_for_each_test(objects):
 def test_the_parametric_data_set_has_386_880_scenes():
     """Three templates of 64 part objects and one of 16, 31 cycles, 60 drops each."""
     plan = config("paper")
-    cycles = sum(len(plan.tasks({"L": n, "G": n})) for n in (64, 64, 64, 16))
+    cycles = sum(len(plan.tasks({"L": range(n), "G": range(n)})) for n in (64, 64, 64, 16))
     assert cycles * len(plan.scene_drops()) == 386_880
 
 
 def test_a_split_of_some_objects_makes_those():
-    tasks = protocol(train=SplitPlan("L", cycles=2, objects=[0, 5])).tasks({"L": 64})
+    tasks = protocol(train=SplitPlan("L", cycles=2, objects=[0, 5])).tasks({"L": range(64)})
     assert [(t.cycle, t.part_index) for t in tasks] == [(0, 0), (0, 5), (1, 0), (1, 5)]
 
 
@@ -51,12 +51,12 @@ def test_small_splits_come_first():
     plan = protocol(
         train=SplitPlan("L", cycles=1), val=SplitPlan("L", cycles=1, first_cycle=1), test_g=SplitPlan("G", 1)
     )
-    assert [t.split for t in plan.tasks({"L": 1, "G": 1})] == ["val", "test_g", "train"]
+    assert [t.split for t in plan.tasks({"L": range(1), "G": range(1)})] == ["val", "test_g", "train"]
 
 
 def test_no_two_tasks_are_one_file():
     plan = protocol(train=SplitPlan("L", cycles=3, clutter=0.5), val=SplitPlan("L", 1, first_cycle=3))
-    names = [(t.split, t.scene_id(0).file_stem) for t in plan.tasks({"L": 4})]
+    names = [(t.split, t.scene_id(0).file_stem) for t in plan.tasks({"L": range(4)})]
     assert len(set(names)) == len(names) == 3 * 4 * 2 + 4
 
 
@@ -111,7 +111,7 @@ def test_another_seed_or_part_draws_other_numbers():
 def test_splits_draw_different_numbers():
     """Splits share no cycle of a grid, so no scene of one is a scene of another."""
     for name in ("paper", "demo", "smoke"):
-        tasks = config(name).tasks({"L": 12, "G": 12})
+        tasks = config(name).tasks({"L": range(12), "G": range(12)})
         numbers = {t.rng(0, "tn34").random() for t in tasks}
         assert len(numbers) == len(tasks)
 
@@ -160,11 +160,11 @@ def test_counts_below_one_are_refused(limit, step, points):
 
 @pytest.mark.parametrize(("size", "places"), [(16, [0, 11]), (64, [0, 44]), (1, [0])])
 def test_a_share_of_a_grid_is_a_place_in_it(size, places):
-    tasks = protocol(train=SplitPlan("L", cycles=1, objects=[0, 0.7])).tasks({"L": size})
+    tasks = protocol(train=SplitPlan("L", cycles=1, objects=[0, 0.7])).tasks({"L": range(size)})
     assert [task.part_index for task in tasks] == places
 
 
 def test_a_part_without_a_generalization_grid_has_no_split_of_it():
     plan = protocol(train=SplitPlan("L", cycles=1), test_g=SplitPlan("G", cycles=1))
-    assert {task.split for task in plan.tasks({"L": 2})} == {"train"}
-    assert {task.split for task in plan.tasks({"L": 2, "G": 2})} == {"train", "test_g"}
+    assert {task.split for task in plan.tasks({"L": range(2)})} == {"train"}
+    assert {task.split for task in plan.tasks({"L": range(2), "G": range(2)})} == {"train", "test_g"}

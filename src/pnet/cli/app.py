@@ -2,23 +2,28 @@
 
 import difflib
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, InstantiationException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from pnet.cli.instantiate import trusted_modules
 
 Task = Callable[[DictConfig], None]
+LONGEST_NAME = 120  # of a folder, in characters
 # what a user can mend; anything else is a fault of ours and keeps its traceback
 EXPECTED = (ValueError, OSError, ModuleNotFoundError, HydraException, OmegaConfBaseException)
 TRACEBACK = "PNET_TRACEBACK"  # set it to 1 to see where an error comes from
@@ -33,9 +38,23 @@ def config_dir() -> Path:
     raise FileNotFoundError(f"pnet's config files are missing beside {package}; install pnet again")
 
 
+def key_of(override: str) -> str:
+    """The key of an override such as +a.b=1."""
+    return override.split("=", 1)[0].lstrip("+~")
+
+
 def run_name(*words: str) -> str:
     """A run folder's name: the words that say something, joined."""
-    return "_".join(word for word in words if word).replace("/", "-")
+    return short_name("_".join(word for word in words if word))
+
+
+def short_name(text: str) -> str:
+    """The text as one folder's name: no separators, and where it is long its beginning and a digest."""
+    plain = re.sub(r"""[]['" ]""", "", text)
+    plain = re.sub(r"[/\\]", "-", plain).replace(",", "+")
+    if len(plain) <= LONGEST_NAME:
+        return plain
+    return f"{plain[: LONGEST_NAME - 9]}-{sha256(plain.encode()).hexdigest()[:8]}"
 
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)
@@ -57,12 +76,21 @@ def run_app(task: Task, config_name: str) -> None:
         fail(fault)
 
 
+class CommandFailed(SystemExit):
+    """Ends a command with exit code 1; `text` is what was printed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(1)
+        self.text = text
+
+
 def fail(fault: BaseException) -> NoReturn:
     """Print one clear line and leave with exit code 1."""
     if os.environ.get(TRACEBACK) == "1":
         raise fault
-    print(f"error: {error_text(fault)}", file=sys.stderr)
-    sys.exit(1)
+    text = error_text(fault)
+    print(f"error: {text}", file=sys.stderr)
+    raise CommandFailed(text) from fault
 
 
 def error_text(fault: BaseException) -> str:
@@ -87,6 +115,8 @@ def _guarded(task: Task) -> Task:
         try:
             task(cfg)
         except EXPECTED as fault:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:  # a launcher would not see a SystemExit's reason
+                raise RuntimeError(error_text(fault)) from fault
             fail(fault)
 
     return guarded

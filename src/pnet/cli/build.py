@@ -1,27 +1,28 @@
 """Objects out of a config: what training and evaluation share."""
 
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from torch import nn
 
+from pnet.backbones.base import Backbone
 from pnet.cli.instantiate import instantiate
+from pnet.cli.settings import is_trained, read_run
 from pnet.data.module import SceneDataModule
-from pnet.models.parametricnet import ParametricNet
 from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointRule
 from pnet.postprocess.pipeline import PoseRecovery
 from pnet.postprocess.vote import MeanVote
 
 if TYPE_CHECKING:
-    from pnet.engine.estimator import NetworkEstimator
+    from pnet.engine.estimator import Estimator, NetworkEstimator, Recovery
 
-CONFIG = "config.yaml"  # a run's settings as they were given, interpolations and all
 UNLEARNT = ("learning", "generalization", "sections")  # keys of a part that weights don't depend on
-RESOLVED = "resolved.yaml"  # the same, resolved: what evaluation reads
 
 
 @dataclass(frozen=True)
@@ -29,23 +30,25 @@ class Parts:
     """The pieces of a run."""
 
     part: ParametricPart
-    network: ParametricNet
-    recovery: PoseRecovery
+    network: nn.Module
+    backbone: Backbone
+    recovery: "Recovery"
 
 
 def build_parts(cfg: DictConfig) -> Parts:
     """Part, network and recovery of a config; the network's weights are drawn from its seed."""
     torch.manual_seed(cfg.seed)
     part: ParametricPart = instantiate(cfg.part)
-    recovery: PoseRecovery = instantiate(cfg.postprocess)
-    if cfg.data.targets.rule == KeypointRule.POINT and isinstance(recovery.voting, MeanVote):
+    recovery = instantiate(cfg.postprocess)
+    plain_means = isinstance(recovery, PoseRecovery) and isinstance(recovery.voting, MeanVote)
+    if cfg.data.targets.rule == KeypointRule.POINT and plain_means:
         raise ValueError(
             "data.targets.rule=point teaches the points of a body different equivalents of a keypoint, and "
             "postprocess.voting takes plain means of them: use postprocess=folded"
         )
     backbone = instantiate(cfg.backbone)
     network = instantiate(cfg.model, backbone=backbone, keypoints=len(part.chain))
-    return Parts(part, network.to(memory_format=torch.channels_last), recovery)
+    return Parts(part, network.to(memory_format=torch.channels_last), backbone, recovery)
 
 
 def build_data(cfg: DictConfig, parts: Parts) -> SceneDataModule:
@@ -61,8 +64,17 @@ def build_data(cfg: DictConfig, parts: Parts) -> SceneDataModule:
         cfg.data.val_every,
         cfg.data.workers,
         cfg.seed,
-        parts.network.backbone.pyramid,
+        parts.backbone.pyramid,
+        share(cfg.data.learn),
     )
+
+
+def share(value: object) -> float:
+    """A share such as 0.2 or 1/5, as a number."""
+    try:
+        return float(Fraction(str(value)))
+    except (ValueError, ZeroDivisionError):
+        raise ValueError(f"data.learn is {value!r}, expected a share in (0, 1], for instance 1/3") from None
 
 
 def identity(cfg: DictConfig) -> dict[str, str]:
@@ -99,36 +111,32 @@ def use_bf16(precision: str, accelerator: str) -> bool:
     return bool(torch.cpu._is_avx512_bf16_supported())
 
 
-def read_run(run: Path) -> DictConfig:
-    """The resolved config of a run folder.
+def load_estimator(run: Path, recovery: DictConfig | None = None) -> "Estimator":
+    """The estimator of a run folder.
 
-    Raises:
-        FileNotFoundError, ValueError: where it is no run of pnet-train; names the file.
+    Args:
+        run: made by pnet-train. recovery: settings of post-processing instead of the run's own.
     """
-    path = run / RESOLVED
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; give a folder that pnet-train made as run=")
-    try:
-        cfg = OmegaConf.load(path)
-    except Exception as fault:  # yaml raises classes of its own
-        raise ValueError(f"{path}: not readable ({' '.join(str(fault).split())})") from fault
-    if not isinstance(cfg, DictConfig) or "part" not in cfg:
-        raise ValueError(f"{path}: not the settings of a training")
-    return cfg
+    cfg = read_run(run)
+    if not is_trained(cfg):
+        estimator: Estimator = instantiate(cfg.method.estimator, part=instantiate(cfg.part))
+        return estimator
+    return load_network(run, cfg, recovery if recovery is not None else cfg.postprocess)
 
 
-def load_estimator(run: Path) -> tuple[DictConfig, "NetworkEstimator"]:
-    """The trained estimator of a run folder, and its config."""
+def load_network(run: Path, cfg: DictConfig, recovery: DictConfig) -> "NetworkEstimator":
+    """The trained network of a run folder with a post-processing."""
     from pnet.engine.checkpoints import NAME, read_checkpoint
     from pnet.engine.estimator import NetworkEstimator
     from pnet.engine.training import check_identity
 
-    cfg = read_run(run)
     checkpoint = run / "checkpoints" / NAME
     content = read_checkpoint(checkpoint)
     try:
         check_identity(content, identity(cfg))
-        parts = build_parts(cfg)
+        changed = cfg.copy()
+        changed.postprocess = recovery
+        parts = build_parts(changed)
         prefix = "network."
         weights = {
             name.removeprefix(prefix): value
@@ -145,4 +153,4 @@ def load_estimator(run: Path) -> tuple[DictConfig, "NetworkEstimator"]:
         raise ValueError(f"{checkpoint}: {fault}") from fault
     network = parts.network.to(device_of(cfg.trainer.accelerator)).eval()
     bf16 = use_bf16(cfg.trainer.precision, cfg.trainer.accelerator)
-    return cfg, NetworkEstimator(parts.part, network, parts.recovery, bf16)
+    return NetworkEstimator(parts.part, network, parts.recovery, bf16)

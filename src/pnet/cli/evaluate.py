@@ -1,18 +1,21 @@
 """pnet-evaluate: predict a split to a file, then score the file."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from pnet.cli.app import closest, key_paths, run_app
+from pnet.cli.app import closest, key_paths, run_app, short_name
+from pnet.cli.settings import is_trained, read_run
 
 if TYPE_CHECKING:
     from pnet.data.scene_folder import SceneFolder
     from pnet.engine.predictions import PredictionHeader
 
+SPLITS = ("val", "test_l", "test_g")
 PREDICTIONS = "predictions.safetensors"
 
 
@@ -21,32 +24,73 @@ def main() -> None:
     run_app(evaluate, "evaluate")
 
 
+@dataclass(frozen=True)
+class Evaluation:
+    """Which scenes a run is scored on, and how its post-processing is changed for it.
+
+    Attributes:
+        split: val, test_l or test_g.
+        postprocess: settings that differ from the run's; with a `_target_` it stands in place of all of them.
+        every: keep every so many scenes of a cycle. root: another data set of the same part, or None.
+    """
+
+    split: str
+    postprocess: dict[str, Any] = field(default_factory=dict)
+    every: int = 1
+    root: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.every < 1:
+            raise ValueError(f"every={self.every}: expected at least 1")
+
+    @property
+    def name(self) -> str:
+        """The folder's name: the split and what differs from the plain evaluation."""
+        changed = [f"{key}-{value}" for key, value in _leaves(self.postprocess)]
+        every = [f"every-{self.every}"] if self.every > 1 else []
+        other = [self.root.name] if self.root else []
+        return short_name("_".join([self.split, *other, *every, *changed]))
+
+    def folder(self, run: Path) -> Path:
+        """Where its files lie."""
+        return run / "evaluation" / self.name
+
+
+def wanted_evaluations(items: Any) -> list[Evaluation]:
+    """What pnet-train's setting `evaluate` asks for: names of splits, or {split: …, postprocess: {…}}."""
+    found = []
+    for item in items or []:
+        settings = {"split": item} if isinstance(item, str) else item
+        if not isinstance(settings, dict) or settings.get("split") not in SPLITS:
+            raise ValueError(f"evaluate holds {item!r}, expected {', '.join(SPLITS)}")
+        found.append(Evaluation(settings["split"], settings.get("postprocess") or {}))
+    return found
+
+
 def evaluate(cfg: DictConfig) -> None:
     """Predict, score and print; each step's file appears when it is whole."""
     import torch
+    from rich.console import Console
 
-    from pnet.cli.build import read_run
+    from pnet.reporting.tables import metrics_table
 
     if cfg.stage not in ("predict", "score", "all"):
         raise ValueError(f"stage={cfg.stage}: choose predict, score or all")
-    if cfg.every < 1:
-        raise ValueError(f"every={cfg.every}: expected at least 1")
+    changes = OmegaConf.to_container(cfg.postprocess)
+    assert isinstance(changes, dict)
+    root = Path(cfg.data.root) if cfg.data.root else None
+    evaluation = Evaluation(cfg.split, {str(k): v for k, v in changes.items()}, cfg.every, root)
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
     run = Path(cfg.run)
     trained = read_run(run)
     if cfg.stage != "score":
-        predict(cfg, run)
+        predict(evaluation, run)
     if cfg.stage != "predict":
-        score(cfg, run, trained)
-
-
-def evaluation_folder(cfg: DictConfig, run: Path) -> Path:
-    """Where the files of this evaluation lie: named by what differs from the plain one."""
-    changed = [f"{key}-{value}" for key, value in _leaves(OmegaConf.to_container(cfg.postprocess))]
-    every = [f"every-{cfg.every}"] if cfg.every > 1 else []
-    other = [Path(cfg.data.root).name] if cfg.data.root else []
-    return run / "evaluation" / "_".join([cfg.split, *other, *every, *changed]).replace("/", "-")
+        metrics = score(evaluation, run, trained)
+        out = Console(soft_wrap=True)
+        out.print(metrics_table(metrics))
+        out.print(f"written to {evaluation.folder(run)}; next: pnet-report run={run}")
 
 
 def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -57,58 +101,82 @@ def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield path, node
 
 
-def open_scenes(cfg: DictConfig, trained: DictConfig) -> tuple["SceneFolder", str]:
+def open_scenes(evaluation: Evaluation, trained: DictConfig) -> tuple["SceneFolder", str]:
     """The scenes to evaluate, and the fingerprint of their data set."""
     from pnet.cli.build import identity
     from pnet.data.scene_folder import SceneFolder
     from pnet.scenes.generation import read_manifest, settings_fingerprint
 
-    root = Path(cfg.data.root or trained.data.root)
+    root = evaluation.root or Path(trained.data.root)
     fingerprint = settings_fingerprint(read_manifest(root))
-    return SceneFolder(root, cfg.split, identity(trained)["part"], cfg.every), fingerprint
+    return SceneFolder(root, evaluation.split, identity(trained)["part"], evaluation.every), fingerprint
 
 
-def recovery_settings(cfg: DictConfig, trained: DictConfig) -> DictConfig:
+def recovery_settings(evaluation: Evaluation, trained: DictConfig) -> DictConfig:
     """The run's post-processing with this evaluation's changes; an unknown key is an error."""
+    changes = OmegaConf.create(evaluation.postprocess)
+    if "_target_" in changes:
+        return changes
     merged = OmegaConf.create(OmegaConf.to_container(trained.postprocess, resolve=True))
+    empty = [key for key, value in _leaves(OmegaConf.to_container(merged)) if value is None]
     known = list(key_paths(OmegaConf.to_container(merged)))
-    for key in key_paths(OmegaConf.to_container(cfg.postprocess)):
-        if key not in known:
+    for key in key_paths(evaluation.postprocess):
+        if key not in known and not key.startswith(tuple(f"{name}." for name in empty)):
             raise ValueError(f"postprocess.{key}: unknown key{closest(key, known)}")
-    return OmegaConf.merge(merged, cfg.postprocess)  # type: ignore[return-value]
+    return OmegaConf.merge(merged, changes)  # type: ignore[return-value]
 
 
-def expected_header(cfg: DictConfig, run: Path, trained: DictConfig, data: str) -> dict[str, str]:
+def expected_header(evaluation: Evaluation, run: Path, trained: DictConfig, data: str) -> dict[str, str]:
     """What predictions of this evaluation must say of themselves."""
     from pnet.cli.build import identity
+
+    recovery = OmegaConf.to_yaml(recovery_settings(evaluation, trained))
+    return {
+        "part": identity(trained)["part"],
+        "split": evaluation.split,
+        "data": data,
+        "weights": _weights_digest(run) if is_trained(trained) else "none",
+        "recovery": sha256(recovery.encode()).hexdigest()[:16],
+    }
+
+
+def _weights_digest(run: Path) -> str:
     from pnet.engine.checkpoints import NAME
 
     weights = run / "checkpoints" / NAME
     if not weights.is_file():
         raise FileNotFoundError(f"{weights}: no checkpoint there; train first with pnet-train")
-    recovery = OmegaConf.to_yaml(recovery_settings(cfg, trained))
-    return {
-        "part": identity(trained)["part"],
-        "split": cfg.split,
-        "data": data,
-        "weights": sha256(weights.read_bytes()).hexdigest()[:16],
-        "recovery": sha256(recovery.encode()).hexdigest()[:16],
-    }
+    return sha256(weights.read_bytes()).hexdigest()[:16]
 
 
-def predict(cfg: DictConfig, run: Path) -> None:
+def is_current(evaluation: Evaluation, run: Path, trained: DictConfig) -> bool:
+    """Whether the run's weights were scored like this already, on the data that is there."""
+    from pnet.engine.predictions import read_predictions
+
+    folder = evaluation.folder(run)
+    if not (folder / "metrics.json").is_file():
+        return False
+    try:
+        scenes, data = open_scenes(evaluation, trained)
+        header, _ = read_predictions(folder / PREDICTIONS)
+        check_predictions(folder, header, expected_header(evaluation, run, trained, data), scenes)
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def predict(evaluation: Evaluation, run: Path) -> None:
     """The first step: detections of every scene into a file."""
     from pnet.cli.build import load_estimator
-    from pnet.cli.instantiate import instantiate
     from pnet.engine.evaluation import predict_scenes
     from pnet.engine.predictions import PredictionHeader, write_predictions
     from pnet.reporting.progress import count_progress
 
-    trained, estimator = load_estimator(run)
-    estimator.recovery = instantiate(recovery_settings(cfg, trained))
-    scenes, data = open_scenes(cfg, trained)
-    expected = expected_header(cfg, run, trained, data)
-    with count_progress(f"predicting {cfg.split}", len(scenes), "scenes") as advance:
+    trained = read_run(run)
+    estimator = load_estimator(run, recovery_settings(evaluation, trained))
+    scenes, data = open_scenes(evaluation, trained)
+    expected = expected_header(evaluation, run, trained, data)
+    with count_progress(f"predicting {evaluation.name}", len(scenes), "scenes") as advance:
         found = predict_scenes(estimator, scenes, trained.data.points, advance)
     timing = estimator.timing
     seconds = {
@@ -117,25 +185,20 @@ def predict(cfg: DictConfig, run: Path) -> None:
     }
     ids = [str(scene_id) for scene_id in scenes.ids]
     header = PredictionHeader(**expected, scenes=ids, seconds=seconds)
-    write_predictions(evaluation_folder(cfg, run) / PREDICTIONS, header, found)
+    write_predictions(evaluation.folder(run) / PREDICTIONS, header, found)
 
 
-def score(cfg: DictConfig, run: Path, trained: DictConfig) -> None:
+def score(evaluation: Evaluation, run: Path, trained: DictConfig) -> dict[str, Any]:
     """The second step: score the file; predictions of anything else are refused."""
-    from rich.console import Console
-
     from pnet.cli.instantiate import instantiate
     from pnet.engine.evaluation import SceneScorer
     from pnet.engine.predictions import read_predictions
     from pnet.engine.provenance import write_json
-    from pnet.reporting.tables import metrics_table
 
-    path = evaluation_folder(cfg, run) / PREDICTIONS
+    path = evaluation.folder(run) / PREDICTIONS
     header, found = read_predictions(path)
-    scenes, data = open_scenes(cfg, trained)
-    check_header(path, header, expected_header(cfg, run, trained, data))
-    if header.scenes != [str(scene_id) for scene_id in scenes.ids]:
-        raise ValueError(f"{path}: holds other scenes than {cfg.split} has now; predict again")
+    scenes, data = open_scenes(evaluation, trained)
+    check_predictions(path, header, expected_header(evaluation, run, trained, data), scenes)
     scorer = SceneScorer(instantiate(trained.part)).add_all(scenes, found)
     curve = scorer.metrics.curve()
     metrics: dict[str, Any] = {
@@ -145,15 +208,17 @@ def score(cfg: DictConfig, run: Path, trained: DictConfig) -> None:
     columns = {"recall": curve.recall.tolist(), "precision": curve.precision.tolist()}
     write_json(path.with_name("curve.json"), columns)
     write_json(path.with_name("metrics.json"), metrics)
-    out = Console(soft_wrap=True)
-    out.print(metrics_table(metrics))
-    out.print(f"written to {path.parent}; next: pnet-report run={run}")
+    return metrics
 
 
-def check_header(path: Path, header: "PredictionHeader", expected: dict[str, str]) -> None:
-    """Raise ValueError where predictions belong to other data, weights or settings."""
+def check_predictions(
+    path: Path, header: "PredictionHeader", expected: dict[str, str], scenes: "SceneFolder"
+) -> None:
+    """Raise ValueError where predictions belong to other data, weights, settings or scenes."""
     for key, value in expected.items():
         if getattr(header, key) != value:
             raise ValueError(
                 f"{path}: its {key} is {getattr(header, key)}, expected {value}; predict again with stage=all"
             )
+    if header.scenes != [str(scene_id) for scene_id in scenes.ids]:
+        raise ValueError(f"{path}: holds other scenes than {header.split} has now; predict again")

@@ -11,8 +11,10 @@ from omegaconf import DictConfig, OmegaConf
 from pnet.cli.app import run_app
 
 if TYPE_CHECKING:
+    from pnet.parts.base import ParametricPart
     from pnet.scenes.factory import SceneFactory
     from pnet.scenes.generation import Summary
+    from pnet.scenes.protocol import CycleTask, Protocol
 
 # what decides a scene's bytes; the rest (workers, folders) does not
 MAKING = ("part", "protocol", "camera", "bin", "physics", "seed", "camera_height", "clutter_spacing")
@@ -25,16 +27,26 @@ def main() -> None:
 
 def generate_data(cfg: DictConfig) -> None:
     """Make what is missing of the data set, with a progress bar and a summary."""
-    from pnet.reporting.progress import scene_progress
-    from pnet.scenes.generation import Summary, generate, open_root
+    from pnet.engine.locks import hold
 
     settings = making_settings(cfg)
     factory = build_factory(cfg, settings)
-    grid_sizes = {name: len(grid) for name, grid in factory.part.grids.items()}
-    tasks = factory.protocol.tasks(grid_sizes)  # may refuse the settings, so before anything is written
+    tasks = plan_tasks(
+        factory.part, factory.protocol
+    )  # may refuse the settings, so before anything is written
     root = Path(cfg.data.root)
-    files = Counter(task.split for task in tasks)
-    open_root(root, {**settings, "files": dict(files)})  # by which a reader sees that none is missing
+    with hold(root, f"another process makes {root}"):
+        make_missing(cfg, factory, manifest_of(settings, tasks), tasks, root)
+
+
+def make_missing(
+    cfg: DictConfig, factory: "SceneFactory", manifest: dict[str, Any], tasks: list["CycleTask"], root: Path
+) -> None:
+    """Make the files that are not there, with a progress bar and a summary."""
+    from pnet.reporting.progress import scene_progress
+    from pnet.scenes.generation import Summary, generate, open_root
+
+    open_root(root, manifest)
     workers = os.cpu_count() or 1 if cfg.workers is None else cfg.workers
     summary, start = Summary(), perf_counter()
     with scene_progress(len(tasks), len(factory.protocol.scene_drops())) as advance:
@@ -46,6 +58,32 @@ def generate_data(cfg: DictConfig) -> None:
             advance(report is not None)
     summary.seconds = perf_counter() - start
     print_summary(root, summary)
+
+
+def plan_tasks(part: "ParametricPart", protocol: "Protocol") -> list["CycleTask"]:
+    """Every file of a part's data set."""
+    from pnet.parts.spread import spread_order
+
+    return protocol.tasks({name: spread_order(grid) for name, grid in part.grids.items()})
+
+
+def manifest_of(settings: dict[str, Any], tasks: list["CycleTask"]) -> dict[str, Any]:
+    """What the data set's manifest says: settings, and how many files there are, so that none is missed."""
+    return {**settings, "files": dict(Counter(task.split for task in tasks))}
+
+
+def is_complete(cfg: DictConfig) -> bool:
+    """Whether the data set of these settings is there with all its files."""
+    from pnet.cli.instantiate import instantiate
+    from pnet.scenes.generation import MANIFEST, cycle_path, read_manifest
+
+    root = Path(cfg.data.root)
+    if not (root / MANIFEST).is_file():
+        return False
+    tasks = plan_tasks(instantiate(cfg.part), instantiate(cfg.protocol))
+    if read_manifest(root) != manifest_of(making_settings(cfg), tasks):
+        return False
+    return all(cycle_path(root, task).is_file() for task in tasks)
 
 
 def making_settings(cfg: DictConfig) -> dict[str, Any]:
@@ -91,3 +129,7 @@ def print_summary(root: Path, summary: "Summary") -> None:
         f"{summary.escaped} bodies left the bin and were removed, {summary.unsettled} scenes were not "
         f"at rest in time, {summary.empty} scenes showed no body and were left out"
     )
+
+
+if __name__ == "__main__":
+    main()

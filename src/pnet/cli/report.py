@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig, OmegaConf
 
 from pnet.cli.app import run_app
+from pnet.cli.settings import read_run
 
 if TYPE_CHECKING:
     from pnet.data.scene_folder import SceneFolder
@@ -23,7 +24,7 @@ def report(cfg: DictConfig) -> None:
     """Write report.html and scene.png into the run's report folder; print their paths and the metrics."""
     from rich.console import Console
 
-    from pnet.cli.build import identity, read_run
+    from pnet.cli.build import identity
     from pnet.cli.evaluate import PREDICTIONS
     from pnet.cli.instantiate import instantiate
     from pnet.data.scene_folder import SceneFolder

@@ -1,12 +1,26 @@
 """pnet-train: train a network on a data set."""
 
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hydra import compose
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from pnet.cli.app import run_app
+from pnet.cli.evaluate import Evaluation, is_current, predict, score, wanted_evaluations
+from pnet.cli.settings import (
+    CONFIG,
+    METRICS,
+    RESOLVED,
+    is_trained,
+    read_run,
+    recipe_text,
+    training_settings,
+)
 
 if TYPE_CHECKING:
     import lightning
@@ -20,28 +34,52 @@ def main() -> None:
 
 
 def train(cfg: DictConfig) -> None:
-    """Train, or go on with a training (`ckpt=last`), and write metrics.json last."""
+    """Train, or go on with a training (`ckpt=last`), evaluate, and write metrics.json last."""
+    from pnet.engine.locks import hold
+    from pnet.engine.provenance import read_json
+
+    if cfg.sweep is not None:
+        raise ValueError(f"sweep={cfg.sweep} declares several trainings: add --multirun")
+    run = Path(cfg.run_dir)
+    evaluations = wanted_evaluations(OmegaConf.to_container(cfg.evaluate, resolve=True))
+    with hold(run, f"another process works on {run}"):
+        if cfg.data.generate is not None:
+            make_data(cfg)
+        if is_trained(cfg):
+            metrics = fit(cfg, run)
+        else:
+            begin_run(cfg, run)
+            metrics = {"steps": 0, "training_seconds": 0.0, "scenes_per_second": None, "validation": {}}
+        if all(is_evaluated(metrics, evaluation, run) for evaluation in evaluations):
+            if not (run / METRICS).is_file():
+                finish(cfg, run, metrics)
+        else:
+            finish(cfg, run, with_evaluations(metrics, evaluations, run))
+        print_end(run, read_json(run / METRICS))
+
+
+def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
+    """Train the network; what came out of it, from metrics.json where the run has ended before."""
     import lightning
     import torch
 
     quiet_lightning()
-    from pnet.cli.build import CONFIG, RESOLVED, build_data, build_parts, device_of, identity, use_bf16
+    from pnet.cli.build import build_data, build_parts, device_of, identity, use_bf16
     from pnet.cli.instantiate import instantiate
     from pnet.engine.allocator import keep_freed_memory
     from pnet.engine.callbacks import PoseValidation, Throughput
     from pnet.engine.checkpoints import NAME, ResumableCheckpoint, read_checkpoint
     from pnet.engine.estimator import NetworkEstimator
-    from pnet.engine.provenance import provenance, read_json, write_json
+    from pnet.engine.provenance import read_json
+    from pnet.engine.tensorboard import add_settings
     from pnet.engine.training import PoseTraining, check_identity
     from pnet.models.summary import summarise
     from pnet.scenes.generation import read_manifest, settings_fingerprint
-    from pnet.scenes.store import write_atomically
 
     if cfg.trainer.threads is not None:
         torch.set_num_threads(cfg.trainer.threads)
     if device_of(cfg.trainer.accelerator) == "cpu":
         keep_freed_memory()
-    run = Path(cfg.run_dir)
     checkpoint = resume_from(cfg.ckpt, run / "checkpoints" / NAME)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
     parts, bf16 = build_parts(cfg), use_bf16(cfg.trainer.precision, cfg.trainer.accelerator)
@@ -50,7 +88,7 @@ def train(cfg: DictConfig) -> None:
     data.train_dataloader()  # says now, before anything is written, what is wrong with the data
     module = PoseTraining(
         parts.network,
-        instantiate(cfg.loss, chain=parts.part.chain),
+        instantiate(cfg.loss, part=parts.part),
         instantiate(cfg.optimizer),
         instantiate(cfg.schedule),
         bf16,
@@ -69,27 +107,79 @@ def train(cfg: DictConfig) -> None:
         if cfg.ckpt == "auto":
             check_same_settings(run, cfg)
         if is_finished(run, cfg.trainer.steps):
-            print_end(run, read_json(run / "metrics.json"))
-            return
-    run.mkdir(parents=True, exist_ok=True)
-    write_atomically(run / CONFIG, OmegaConf.to_yaml(cfg).encode())
-    write_atomically(run / RESOLVED, OmegaConf.to_yaml(cfg, resolve=True).encode())
-    write_json(run / "provenance.json", provenance(cfg.seed))
-    (run / "metrics.json").unlink(missing_ok=True)
+            return read_json(run / METRICS)
+    begin_run(cfg, run)
     full = validation[len(validation) - 1]  # cycles end with a full bin
     summary = summarise(parts.network, torch.from_numpy(full.points[: cfg.data.points]))
     print(summary)
+    add_settings(trainer.logger.experiment, OmegaConf.to_yaml(cfg))  # type: ignore[union-attr]
     try:
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     except SystemExit:  # what Lightning makes of Ctrl-C
         raise KeyboardInterrupt from None
     if "val/AP" not in trainer.callback_metrics:  # killed after the last step: validated but not written
         trainer.validate(module, datamodule=data, verbose=False)
-    metrics = final_metrics(trainer, throughput)
-    log_settings(trainer, cfg, metrics)
-    metrics["network"] = vars(summary)
-    write_json(run / "metrics.json", metrics)
-    print_end(run, metrics)
+    return {
+        **final_metrics(trainer, throughput),
+        "recipe": recipe_text(training_settings(cfg)),
+        "network": vars(summary),
+    }
+
+
+def begin_run(cfg: DictConfig, run: Path) -> None:
+    """Write what the run is made of; metrics.json of an earlier one goes."""
+    from pnet.engine.provenance import provenance, write_json
+    from pnet.scenes.store import write_atomically
+
+    run.mkdir(parents=True, exist_ok=True)
+    (run / METRICS).unlink(missing_ok=True)
+    write_atomically(run / CONFIG, OmegaConf.to_yaml(cfg).encode())
+    write_atomically(run / RESOLVED, OmegaConf.to_yaml(cfg, resolve=True).encode())
+    write_json(run / "provenance.json", provenance(cfg.seed))
+
+
+def is_evaluated(metrics: dict[str, Any], evaluation: Evaluation, run: Path) -> bool:
+    """Whether a run's metrics hold this evaluation of its weights."""
+    return evaluation.name in metrics.get("evaluations", {}) and is_current(evaluation, run, read_run(run))
+
+
+def with_evaluations(metrics: dict[str, Any], evaluations: list[Evaluation], run: Path) -> dict[str, Any]:
+    """The metrics of a run, and those of its evaluations; what is there already is not done again."""
+    from pnet.engine.provenance import read_json
+
+    trained, done = read_run(run), dict(metrics.get("evaluations", {}))
+    for evaluation in evaluations:
+        if not is_current(evaluation, run, trained):
+            predict(evaluation, run)
+            score(evaluation, run, trained)
+        found = read_json(evaluation.folder(run) / METRICS)
+        done[evaluation.name] = {"split": evaluation.split, "postprocess": evaluation.postprocess, **found}
+    return {**metrics, "evaluations": done}
+
+
+def finish(cfg: DictConfig, run: Path, metrics: dict[str, Any]) -> None:
+    """Tell TensorBoard what came out, then write metrics.json: with it the run is done."""
+    from pnet.engine.provenance import write_json
+    from pnet.engine.tensorboard import log_hyperparameters
+
+    log_hyperparameters(run / "tensorboard", chosen_settings(cfg), final_scores(metrics))
+    write_json(run / METRICS, metrics)
+
+
+def make_data(cfg: DictConfig) -> None:
+    """Have pnet-generate make what is missing of the data set, in a process of its own."""
+    from pnet.cli.generate import is_complete
+
+    chosen = HydraConfig.get().overrides.task
+    kept = [
+        word for word in chosen if word.lstrip("+").startswith(("part=", "part.", "protocol=", "protocol."))
+    ]
+    overrides = [*kept, f"data.root={cfg.data.root}", *cfg.data.generate]
+    if is_complete(compose("generate", overrides=overrides)):
+        return
+    done = subprocess.run([sys.executable, "-m", "pnet.cli.generate", *overrides])
+    if done.returncode:
+        raise ValueError(f"{cfg.data.root}: the scenes could not be made, see above")
 
 
 def quiet_lightning() -> None:
@@ -128,18 +218,15 @@ def is_finished(run: Path, steps: int) -> bool:
     """Whether a run's training has ended after at least so many steps."""
     from pnet.engine.provenance import read_json
 
-    path = run / "metrics.json"
+    path = run / METRICS
     return path.is_file() and int(read_json(path).get("steps") or 0) >= steps
 
 
 def check_same_settings(run: Path, cfg: DictConfig) -> None:
     """Raise ValueError where a run was begun with other settings than these; names the first few."""
-    from pnet.cli.build import read_run
     from pnet.scenes.generation import differences
 
-    free = ("ckpt", "run_dir", "trainer.threads")  # decide nothing
-    old, new = (OmegaConf.to_container(c, resolve=True) for c in (read_run(run), cfg))
-    differing = sorted(text for text in differences(old, new) if not text.startswith(free))
+    differing = sorted(differences(training_settings(read_run(run)), training_settings(cfg)))
     if differing:
         raise ValueError(
             f"{run}: holds a training with other settings: {'; '.join(differing[:4])}. "
@@ -198,32 +285,33 @@ def final_metrics(trainer: "lightning.Trainer", throughput: "Throughput") -> dic
     }
 
 
-def log_settings(trainer: "lightning.Trainer", cfg: DictConfig, metrics: dict[str, Any]) -> None:
-    """The settings for TensorBoard: as text, and as hyperparameters beside the final AP."""
-    from lightning.pytorch.loggers import TensorBoardLogger
-
-    logger = trainer.logger
-    if not isinstance(logger, TensorBoardLogger):
-        return
-    logger.experiment.add_text("settings", f"```yaml\n{OmegaConf.to_yaml(cfg, resolve=True)}\n```")
-    chosen = {
+def chosen_settings(cfg: DictConfig) -> dict[str, Any]:
+    """What TensorBoard's page of hyperparameters compares runs by."""
+    return {
         "part": identity_name(cfg.part._target_),
+        "protocol": cfg.protocol.name,
+        "method": cfg.method.name,
         "backbone": identity_name(cfg.backbone._target_),
-        "loss": cfg.loss.norm,
+        "loss": cfg.loss.get("norm", identity_name(cfg.loss._target_)),
         "optimizer": identity_name(cfg.optimizer._target_),
         "lr": cfg.optimizer.lr,
         "batch_size": cfg.data.batch_size,
         "steps": cfg.trainer.steps,
         "keypoint_rule": cfg.data.targets.rule,
+        "visibility_module": cfg.model.visibility,
+        "learn": str(cfg.data.learn),
         "seed": cfg.seed,
     }
-    scores = {
-        f"final/{name}": metrics["validation"][name]
-        for name in ("AP", "mAP", "loss")
-        if name in metrics["validation"]
-    }
-    logger.log_hyperparams(chosen, scores)
-    logger.experiment.flush()
+
+
+def final_scores(metrics: dict[str, Any]) -> dict[str, float]:
+    """mAP on validation scenes and on each evaluation, by tag."""
+    plain = {"test_l": "final/mAP_L", "test_g": "final/mAP_G"}
+    scores = {f"final/{name}_val": metrics["validation"].get(name) for name in ("AP", "mAP", "loss")}
+    for name, values in metrics.get("evaluations", {}).items():
+        if name in plain:
+            scores[plain[name]] = values.get("mAP")
+    return {tag: value for tag, value in scores.items() if value is not None and value == value}
 
 
 def identity_name(target: str) -> str:
@@ -242,4 +330,12 @@ def print_end(run: Path, metrics: dict[str, Any]) -> None:
         f"({metrics['scenes_per_second'] or 0:.1f} scenes/s)"
         + (f"; validation AP {ap:.3f}" if ap is not None else "")
     )
-    out.print(f"run in {run}; next: pnet-evaluate run={run}")
+    evaluations = metrics.get("evaluations", {})
+    for name, values in evaluations.items():
+        out.print(f"{name}: mAP {values['mAP'] or 0:.3f}, AP {values['AP'] or 0:.3f}")
+    more = "" if evaluations else f"; next: pnet-evaluate run={run}"
+    out.print(f"run in {run}{more}")
+
+
+if __name__ == "__main__":
+    main()

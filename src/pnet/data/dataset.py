@@ -10,8 +10,9 @@ from torch.utils.data import Dataset, Sampler, default_collate
 
 from pnet.data.augmentation import Augmentation
 from pnet.data.scene_folder import SceneFolder
-from pnet.data.targets import point_labels
+from pnet.data.targets import point_labels, pose_labels
 from pnet.ops.pyramid import Pyramid, Tables
+from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointChoice
 from pnet.parts.keypoints import KeypointChain
 from pnet.records import Batch, Scene
@@ -28,6 +29,7 @@ class LabelledScenes(Dataset[Item]):
         points: take the first so many of each scene's points (they are in sampling order), or None.
         augmentation: for training, else None. seed: of the augmentation.
         pyramid: the backbone's neighbour tables to find here, by the loader's workers; None: none.
+        posed: the part, for a method that is taught poses; None: no such labels.
     """
 
     def __init__(
@@ -39,6 +41,7 @@ class LabelledScenes(Dataset[Item]):
         augmentation: Augmentation | None = None,
         seed: int = 0,
         pyramid: Pyramid | None = None,
+        posed: ParametricPart | None = None,
     ) -> None:
         if points is not None and points > scenes.points_per_scene:
             raise ValueError(
@@ -48,6 +51,7 @@ class LabelledScenes(Dataset[Item]):
         self.scenes, self.points = scenes, points
         self._chain, self._choice = chain, choice
         self._augmentation, self._seed, self._pyramid = augmentation, seed, pyramid
+        self._posed = posed
 
     def __len__(self) -> int:
         return len(self.scenes)
@@ -59,6 +63,8 @@ class LabelledScenes(Dataset[Item]):
             scene = self._augmentation(scene, np.random.default_rng([self._seed, epoch, index]))
         labels = point_labels(scene, self._chain, self._choice)
         item: Item = {**labels, "scene": torch.tensor(index)}
+        if self._posed is not None:
+            item.update(pose_labels(scene, self._posed))
         if self._pyramid is not None:  # of the points as augmented: octants follow the axes
             item["tables"] = {k: v[0] for k, v in self._pyramid(labels["points"][None]).items()}
         return item

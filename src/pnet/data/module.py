@@ -15,6 +15,7 @@ from pnet.data.scene_folder import SceneFolder
 from pnet.ops.pyramid import Pyramid
 from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointChoice, KeypointRule
+from pnet.parts.spread import spread_order
 
 
 @dataclass(frozen=True)
@@ -25,10 +26,12 @@ class Targets:
         rule: which of the equivalent keypoints is the label: "camera" (GU, equation 1), "canonical" (the
             ablation "w/o GU") or "point" (nearest to the surface point; needs `FoldedVote`).
         direction: of the camera rule, see `KeypointChoice`; the paper's is (0, 0, 1).
+        poses: also label every point with its instance's rotation, for methods that regress it.
     """
 
     rule: str = "camera"
     direction: Sequence[float] = (0.0, 0.0, 1.0)
+    poses: bool = False
 
     @property
     def choice(self) -> KeypointChoice:
@@ -49,6 +52,8 @@ class SceneDataModule(lightning.LightningDataModule):
         batch_size: scenes. draws: scenes of an epoch; None: each once.
         val_every: keep every so many validation scenes. workers: loader processes. seed: of order and chance.
         pyramid: the backbone's neighbour tables for the loaders to find, or None.
+        learn: share of the training's part objects that are learnt, spread over the grid, in (0, 1] (the
+            paper's Table IV: 1/3 and 1/5). At least one is.
     """
 
     def __init__(
@@ -64,8 +69,11 @@ class SceneDataModule(lightning.LightningDataModule):
         workers: int,
         seed: int,
         pyramid: Pyramid | None = None,
+        learn: float = 1.0,
     ) -> None:
         super().__init__()
+        if not 0 < learn <= 1:
+            raise ValueError(f"data.learn is {learn:g}, expected a share in (0, 1], for instance 1/3")
         if points is not None and points < 1:
             raise ValueError(f"data.points is {points}, expected at least 1, or null for all")
         if batch_size < 1:
@@ -73,15 +81,24 @@ class SceneDataModule(lightning.LightningDataModule):
         self.part, self.root, self.targets, self.points = part, Path(root), targets, points
         self._augmentation, self._batch_size, self._draws = augmentation, batch_size, draws
         self._val_every, self._workers, self._seed = val_every, workers, seed
-        self._pyramid = pyramid
+        self._pyramid, self._learn = pyramid, learn
 
     def scenes(self, split: str, every: int = 1) -> SceneFolder:
         """The scenes of a split."""
         return SceneFolder(self.root, split, self.part.name, every)
 
+    def train_scenes(self) -> SceneFolder:
+        """The training scenes of the part objects that are learnt."""
+        return SceneFolder(self.root, "train", self.part.name, keep=self._learnt if self._learn < 1 else None)
+
+    def _learnt(self, objects: set[int]) -> set[int]:
+        """Of the part objects (places in the L grid) those to learn."""
+        ordered = [place for place in spread_order(self.part.grids["L"]) if place in objects]
+        return set(ordered[: max(1, round(self._learn * len(ordered)))])
+
     def train_dataloader(self) -> DataLoader[Any]:
         """Training scenes, augmented, in an order that (seed, epoch) decides."""
-        scenes = self.scenes("train")
+        scenes = self.train_scenes()
         dataset = LabelledScenes(
             scenes,
             self.part.chain,
@@ -90,6 +107,7 @@ class SceneDataModule(lightning.LightningDataModule):
             self._augmentation,
             self._seed,
             self._pyramid,
+            self._posed,
         )
         if (self._draws or len(scenes)) < self._batch_size:
             raise ValueError(
@@ -109,9 +127,18 @@ class SceneDataModule(lightning.LightningDataModule):
 
     def _unchanged(self, scenes: SceneFolder) -> DataLoader[Any]:
         dataset = LabelledScenes(
-            scenes, self.part.chain, self.targets.choice, self.points, pyramid=self._pyramid
+            scenes,
+            self.part.chain,
+            self.targets.choice,
+            self.points,
+            pyramid=self._pyramid,
+            posed=self._posed,
         )
         return self._loader(dataset, None, drop_last=False)
+
+    @property
+    def _posed(self) -> ParametricPart | None:
+        return self.part if self.targets.poses else None
 
     def _loader(
         self, dataset: LabelledScenes, sampler: EpochSampler | None, drop_last: bool

@@ -1,7 +1,7 @@
 """The scenes of one split of pnet's own store, by index."""
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import accumulate
 from pathlib import Path
 
@@ -17,11 +17,19 @@ class SceneFolder(Sequence[Scene]):
         root: the data set's folder. split: "train", "val", "test_l" or "test_g".
         part: the template's name that the scenes must show.
         every: keep every so many scenes only, counted from the end of each cycle.
+        keep: of the part objects there (places in their grid) those to keep; None: all.
     Raises:
         FileNotFoundError, ValueError: where the split is missing, empty, damaged or of another part.
     """
 
-    def __init__(self, root: Path, split: str, part: str, every: int = 1) -> None:
+    def __init__(
+        self,
+        root: Path,
+        split: str,
+        part: str,
+        every: int = 1,
+        keep: Callable[[set[int]], set[int]] | None = None,
+    ) -> None:
         self._paths = sorted((root / split).glob(f"[!.]*{SUFFIX}"))
         if not self._paths:
             raise FileNotFoundError(
@@ -39,6 +47,10 @@ class SceneFolder(Sequence[Scene]):
                     f"{file.path}: shows {file.header.part}, not {part}; set part={file.header.part} "
                     "or another data.root"
                 )
+        if keep is not None:
+            objects = keep({file.header.part_index for file in files})
+            files = [file for file in files if file.header.part_index in objects]
+            self._paths = [file.path for file in files]
         self.points_per_scene = min((file.points_per_scene for file in files if len(file)), default=0)
         chosen = [list(range(len(file)))[::-1][::every][::-1] for file in files]
         self._index = chosen

@@ -1,9 +1,14 @@
 """Per-point labels, computed when a scene is loaded; the store keeps none of them."""
 
+from functools import lru_cache
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from pnet.geometry.rigid import apply_inverse_pose, apply_pose
+from pnet.geometry.symmetry import FiniteSymmetry, RevolutionSymmetry
+from pnet.parts.base import ParametricPart, Points
 from pnet.parts.choice import KeypointChoice, KeypointRule, NearestToPoint
 from pnet.parts.keypoints import KeypointChain
 from pnet.records import Scene
@@ -63,3 +68,41 @@ def point_labels(scene: Scene, chain: KeypointChain, choice: KeypointChoice) -> 
     labels = {name: value.float()[owner] for name, value in per_instance.items()}
     points = torch.from_numpy(scene.points)
     return {"points": points, "keypoints": keypoints.float(), "margin": margin.float(), **labels}
+
+
+def pose_labels(scene: Scene, part: ParametricPart) -> dict[str, Tensor]:
+    """What a method is taught that regresses the pose itself (PPR-Net).
+
+    Args:
+        scene: N points on d instances, all of one part object.
+    Returns:
+        float32 tensors: rotation (N, 3, 3) part → camera, one of the equivalents; scale (3, 3), see
+        `pose_scale`.
+    """
+    rotation = torch.from_numpy(scene.R).float()[torch.from_numpy(scene.instance)]
+    size = scene.parameters[0] if len(scene.parameters) else part.part_object("L", 0)
+    return {"rotation": rotation, "scale": pose_scale(part, size).float()}
+
+
+@lru_cache(maxsize=1024)
+def _pose_scale(part: ParametricPart, parameters: tuple[float, ...]) -> Tensor:
+    space = part.pose_space(np.array(parameters))
+    match space.symmetry:
+        case FiniteSymmetry():
+            return space.frame_R.T @ space.scale @ space.frame_R
+        case RevolutionSymmetry():
+            return space.scale * torch.eye(3, dtype=torch.float64)
+        case _:
+            return torch.zeros(3, 3, dtype=torch.float64)  # turning a sphere moves nothing
+
+
+def pose_scale(part: ParametricPart, parameters: Points) -> Tensor:
+    """Λ of a part object, turned into the part frame: ‖(R − R') Λ‖ is the length by which two rotations of it
+    differ (Brégier et al.); for a revolution λ times the identity, for a sphere zero.
+
+    Args:
+        parameters: (k,) metres.
+    Returns:
+        (3, 3) float64 metres.
+    """
+    return _pose_scale(part, tuple(parameters.tolist()))

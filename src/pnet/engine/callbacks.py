@@ -4,20 +4,13 @@ from collections.abc import Sequence
 from time import perf_counter
 
 import lightning
-import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
-from torch import Tensor
-from torch.utils.tensorboard import SummaryWriter
 
 from pnet.engine.estimator import NetworkEstimator
 from pnet.engine.evaluation import SceneScorer
-from pnet.parts.base import ParametricPart
+from pnet.engine.tensorboard import add_curve, add_mesh
 from pnet.records import Detections, Scene
-
-COLOURS = 255 * np.array(
-    [[0.12, 0.47, 0.71], [1, 0.5, 0.05], [0.17, 0.63, 0.17], [0.84, 0.15, 0.16], [0.58, 0.4, 0.74]]
-)
 
 
 class PoseValidation(lightning.Callback):
@@ -58,9 +51,9 @@ class PoseValidation(lightning.Callback):
         pl_module.log_dict(values, prog_bar=False)
         if isinstance(trainer.logger, TensorBoardLogger):
             writer = trainer.logger.experiment
-            _add_curve(writer, scorer, trainer.global_step)
+            add_curve(writer, scorer, trainer.global_step)
             if fullest and self._mesh_every and self._validations % self._mesh_every == 0:
-                _add_mesh(writer, self._estimator.part, *fullest, trainer.global_step)
+                add_mesh(writer, self._estimator.part, *fullest, trainer.global_step)
         self._validations += 1
 
 
@@ -68,12 +61,20 @@ class Throughput(lightning.Callback):
     """Scenes per second of the training, logged and kept.
 
     Attributes:
-        scenes, seconds: seen and spent since this process began to train, validation left out.
+        scenes, seconds: seen and spent by the training, also before an interruption; validation left out.
     """
 
     def __init__(self) -> None:
         self.scenes, self.seconds = 0, 0.0
         self._start: float | None = None
+
+    def state_dict(self) -> dict[str, float]:
+        """Kept in checkpoints."""
+        return {"scenes": self.scenes, "seconds": self.seconds}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        """Of the checkpoint that a training goes on from."""
+        self.scenes, self.seconds = int(state_dict["scenes"]), state_dict["seconds"]
 
     def on_train_batch_start(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, *_: object
@@ -102,50 +103,3 @@ class Throughput(lightning.Callback):
     def on_validation_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Stop the clock."""
         self._start = None
-
-
-def _add_curve(writer: SummaryWriter, scorer: SceneScorer, step: int) -> None:
-    from matplotlib.figure import Figure
-
-    curve = scorer.metrics.curve()
-    figure = Figure(figsize=(4, 4), layout="tight")
-    axes = figure.subplots()
-    axes.step(curve.recall, curve.precision, where="pre")
-    axes.set(xlabel="recall", ylabel="precision", xlim=(0, 1.01), ylim=(0, 1.01))
-    axes.grid(alpha=0.3)
-    writer.add_figure("val/precision_recall", figure, step)
-
-
-def _add_mesh(
-    writer: SummaryWriter, part: ParametricPart, scene: Scene, found: Detections, step: int
-) -> None:
-    """The scene's points, and the estimated parts as meshes, in metres, with y and z up."""
-    up = np.array([1.0, -1.0, -1.0])
-    middle = scene.points.mean(0)
-    writer.add_mesh("val/points", _batch((scene.points - middle) * up), global_step=step)
-    vertices, faces, colours, first = [], [], [], 0
-    for i in range(len(found.score)):
-        size = found.parameters[i].numpy()
-        if not (np.isfinite(size).all() and (size > 0).all()):
-            continue  # early in training a vote can make no solid
-        try:
-            mesh = part.mesh(size)
-        except ValueError:
-            continue
-        placed = np.asarray(mesh.vertices) @ found.R[i].numpy().T + found.t[i].numpy()
-        vertices.append((placed - middle) * up)
-        faces.append(np.asarray(mesh.faces) + first)
-        colours.append(np.tile(COLOURS[i % len(COLOURS)], (len(placed), 1)))
-        first += len(placed)
-    if vertices:
-        writer.add_mesh(
-            "val/estimates",
-            _batch(np.concatenate(vertices)),
-            torch.from_numpy(np.concatenate(colours)).to(torch.uint8)[None],
-            torch.from_numpy(np.concatenate(faces)).int()[None],
-            global_step=step,
-        )
-
-
-def _batch(vertices: np.ndarray) -> Tensor:
-    return torch.from_numpy(vertices).float()[None]

@@ -2,14 +2,13 @@
 
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from pnet.models.parametricnet import ParametricNet
 from pnet.parts.base import ParametricPart
-from pnet.postprocess.pipeline import PoseRecovery, no_detections
+from pnet.postprocess.pipeline import no_detections
 from pnet.records import Detections
 
 
@@ -33,13 +32,27 @@ class Estimator(Protocol):
         ...
 
 
+class Recovery(Protocol):
+    """A learned method's post-processing: what its network says of points → instances."""
+
+    def __call__(
+        self, part: ParametricPart, prediction: Any, scene: int, points: Tensor | None = None
+    ) -> Detections:
+        """Of one scene of a batch; points: (N, 3) its cloud, camera frame, metres."""
+        ...
+
+
 @dataclass
 class NetworkEstimator:
-    """A trained network and the recovery of poses from its predictions."""
+    """A trained network and the recovery of poses from its predictions.
+
+    Attributes:
+        network: (B, N, 3) points to the prediction that `recovery` understands.
+    """
 
     part: ParametricPart
-    network: ParametricNet
-    recovery: PoseRecovery
+    network: nn.Module
+    recovery: Recovery
     bf16: bool = False
     timing: Timing = field(default_factory=Timing)
 
@@ -48,13 +61,7 @@ class NetworkEstimator:
         """Detections of each cloud; none where a cloud has no point."""
         if points.shape[1] == 0:
             return [no_detections(self.part, 0) for _ in points]
-        if not bool(torch.isfinite(points).all()):
-            raise ValueError("the cloud has NaN or infinite coordinates; remove those points first")
-        if bool((points[..., 2] <= 0).any()):
-            raise ValueError(
-                "the cloud has points at or behind the camera (z <= 0); remove them, or turn the cloud into "
-                "the camera frame: x right, y down, z forward, metres"
-            )
+        check_points(points)
         device = next(self.network.parameters()).device
         training = self.network.training
         self.network.eval()
@@ -64,9 +71,20 @@ class NetworkEstimator:
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         middle = perf_counter()
-        found = [self.recovery(self.part, prediction, i) for i in range(len(points))]
+        found = [self.recovery(self.part, prediction, i, points[i]) for i in range(len(points))]
         self.timing.network += middle - start
         self.timing.postprocess += perf_counter() - middle
         self.timing.scenes += len(points)
         self.network.train(training)
         return found
+
+
+def check_points(points: Tensor) -> None:
+    """Raise ValueError where points (..., 3) are not in front of a camera; says what to do."""
+    if not bool(torch.isfinite(points).all()):
+        raise ValueError("the cloud has NaN or infinite coordinates; remove those points first")
+    if bool((points[..., 2] <= 0).any()):
+        raise ValueError(
+            "the cloud has points at or behind the camera (z <= 0); remove them, or turn the cloud into "
+            "the camera frame: x right, y down, z forward, metres"
+        )

@@ -5,14 +5,13 @@ from typing import Any
 
 import lightning
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import Parameter
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from pnet.engine.schedules import Schedule
-from pnet.models.losses import ParametricLoss
-from pnet.models.parametricnet import ParametricNet
+from pnet.models.losses import Loss
 from pnet.records import Batch
 
 Optimization = Callable[[Iterable[Parameter]], Optimizer]
@@ -30,8 +29,8 @@ class PoseTraining(lightning.LightningModule):
 
     def __init__(
         self,
-        network: ParametricNet,
-        loss: ParametricLoss,
+        network: nn.Module,
+        loss: Loss,
         optimizer: Optimization,
         schedule: Schedule,
         bf16: bool,
@@ -47,8 +46,8 @@ class PoseTraining(lightning.LightningModule):
         """Loss of a batch; each module's own is logged."""
         losses = self._losses(batch)
         self._log("train", losses, len(batch.points))
-        for name, share in self.loss.ambiguity(batch).items():
-            self.log(f"ambiguous_labels/{name}", share, batch_size=len(batch.points))
+        for tag, value in self.loss.remarks(batch).items():
+            self.log(tag, value, batch_size=len(batch.points))
         return losses["loss"]
 
     def validation_step(self, batch: Batch, index: int) -> None:

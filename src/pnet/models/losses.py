@@ -1,11 +1,12 @@
 """The loss of ParametricNet (equations 2 to 5 and 7)."""
 
 from enum import StrEnum
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from pnet.parts.keypoints import KeypointChain
+from pnet.parts.base import ParametricPart
 from pnet.records import Batch, PointPrediction
 
 AMBIGUOUS = 1e-3  # metres: a label whose runner-up is nearer than this may well have been the other one
@@ -19,11 +20,23 @@ class Norm(StrEnum):
     EACH = "each"  # mean ‖e_j‖ of every keypoint by itself: one that is ambiguous cannot drown the others
 
 
+class Loss(Protocol):
+    """What a method's training minimises."""
+
+    def __call__(self, predicted: Any, batch: Batch) -> dict[str, Tensor]:
+        """ "loss", and its terms by name; scalars. predicted: what the method's network returns."""
+        ...
+
+    def remarks(self, batch: Batch) -> dict[str, Tensor]:
+        """What else is worth a curve, by its tag; scalars."""
+        ...
+
+
 class ParametricLoss:
     """Weighted sum of the losses of the modules (equation 2).
 
     Args:
-        chain: the part's keypoints, for M_P.
+        part: whose keypoints give the parameters (M_P).
         norm: for centroids and keypoints.
         margin: metres; a keypoint label that is no better than its runner-up by much more than this counts
             less, by margin_of_label / (margin_of_label + margin). None: every label counts alike.
@@ -33,7 +46,7 @@ class ParametricLoss:
 
     def __init__(
         self,
-        chain: KeypointChain,
+        part: ParametricPart,
         norm: str,
         margin: float | None = None,
         centroid: float | None = None,
@@ -41,6 +54,7 @@ class ParametricLoss:
         parameters: float | None = None,
         visibility: float | None = None,
     ) -> None:
+        chain = part.chain
         m, k = len(chain), len(chain.parameters)
         if margin is not None and margin <= 0:
             raise ValueError(f"loss.margin is {margin}, expected a positive length in metres or null")
@@ -70,10 +84,11 @@ class ParametricLoss:
         total = torch.stack([self.weights[name] * loss for name, loss in losses.items()]).sum()
         return {"loss": total, **losses}
 
-    def ambiguity(self, batch: Batch) -> dict[str, Tensor]:
-        """Keypoint name → share of its labels whose runner-up is less than `AMBIGUOUS` worse."""
+    def remarks(self, batch: Batch) -> dict[str, Tensor]:
+        """By keypoint the share of its labels whose runner-up is less than `AMBIGUOUS` worse."""
         share = (batch.margin < AMBIGUOUS).float().mean((0, 1))
-        return dict(zip(self._chain.names, share.unbind(), strict=True))
+        names = (f"ambiguous_labels/{name}" for name in self._chain.names)
+        return dict(zip(names, share.unbind(), strict=True))
 
     def _keypoints(self, error: Tensor, margin: Tensor) -> Tensor:
         squared = error.square().sum(-1)

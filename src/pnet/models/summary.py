@@ -4,10 +4,8 @@ from copy import deepcopy
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
-
-from pnet.models.parametricnet import ParametricNet
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,7 @@ class NetworkSummary:
         )
 
 
-def summarise(network: ParametricNet, points: Tensor) -> NetworkSummary:
+def summarise(network: nn.Module, points: Tensor) -> NetworkSummary:
     """Count on one scene; the network stays as it is.
 
     Args:

@@ -8,8 +8,10 @@ from torch import Tensor
 from pnet.parts.base import ParametricPart
 from pnet.postprocess.cluster import CentroidClusters
 from pnet.postprocess.fit import fit_pose
+from pnet.postprocess.icp import IcpRefinement
 from pnet.postprocess.radius_filter import RadiusFilter
-from pnet.postprocess.vote import PointVotes, Voting, vote
+from pnet.postprocess.score import instance_score, sure_enough
+from pnet.postprocess.vote import PointVotes, Voting
 from pnet.records import Detections, PointPrediction
 
 
@@ -28,6 +30,7 @@ class PoseRecovery:
             `trust` the error of votes that agree, metres. None: equal weights, as equation 6 has it. Where
             a label is ambiguous (a flat ring seen along its axis has no nearest rim point) votes disagree
             and their mean is far from every equivalent; the weight keeps it from dragging the pose along.
+        refine: ICP against the cloud, or None.
     """
 
     cluster: CentroidClusters
@@ -37,12 +40,16 @@ class PoseRecovery:
     scene_parameters: bool
     best_visible: float
     trust: float | None
+    refine: IcpRefinement | None = None
 
-    def __call__(self, part: ParametricPart, prediction: PointPrediction, scene: int) -> Detections:
+    def __call__(
+        self, part: ParametricPart, prediction: PointPrediction, scene: int, points: Tensor | None = None
+    ) -> Detections:
         """Recover the instances of one scene of a batch.
 
         Args:
             part: the template. prediction: of a batch. scene: index into the batch.
+            points: (N, 3) the scene's cloud, camera frame, metres; for `refine`.
         """
         centroids = prediction.centroid[scene].cpu().double()
         keypoints = prediction.keypoints[scene].cpu().double()
@@ -52,18 +59,21 @@ class PoseRecovery:
         d = int(labels.max()) + 1 if len(labels) else 0
         if d == 0:
             return no_detections(part, len(labels))
-        visibility = self._score(prediction, scene, labels, d)
+        visibility = None if prediction.visibility is None else prediction.visibility[scene]
+        score = instance_score(visibility, labels, d)
         votes = PointVotes(centroids, keypoints, labels, d, self._reliable(centroids, keypoints, labels))
         agreed = self.voting(part, votes)
-        parameters = self._share(agreed.parameters, visibility)
+        parameters = self._share(agreed.parameters, score)
         if part.is_fixed:
             parameters = torch.from_numpy(part.grids["L"][0]).expand_as(parameters).clone()
         weight = None if self.trust is None else 1 / (agreed.spread.square() + self.trust**2)
         R, t = fit_pose(part.chain, parameters, agreed.centroid, agreed.keypoints, weight)
-        found = Detections(R, t, parameters, visibility, agreed.keypoints, labels)
-        # without M_V nothing is known of visibility, so nothing is left out for it
-        threshold = self.visibility_threshold if prediction.visibility is not None else 0.0
-        return best_first(found, visibility >= threshold)
+        if self.refine is not None:
+            if points is None:
+                raise ValueError("postprocess.refine needs the scene's points")
+            R, t = self.refine(part, parameters, R, t, points.cpu().double(), labels)
+        found = Detections(R, t, parameters, score, agreed.keypoints, labels)
+        return best_first(found, sure_enough(score, visibility, self.visibility_threshold))
 
     def _reliable(self, centroids: Tensor, keypoints: Tensor, labels: Tensor) -> Tensor:
         """(N, 1 + m) or (N, 1) which votes count: those in a cluster that the radius filter keeps."""
@@ -74,18 +84,11 @@ class PoseRecovery:
             return (labels >= 0)[:, None].expand(-1, places.shape[1])
         return torch.stack([self.radius_filter(votes, labels) for votes in places.unbind(1)], 1)
 
-    def _score(self, prediction: PointPrediction, scene: int, labels: Tensor, d: int) -> Tensor:
-        """(d,) voted visibility; without M_V each cluster's number of points over the largest."""
-        if prediction.visibility is not None:
-            return vote(prediction.visibility[scene].cpu().double(), labels, labels >= 0, d)
-        size = torch.bincount(labels[labels >= 0], minlength=d).double()
-        return size / size.max()
-
-    def _share(self, parameters: Tensor, visibility: Tensor) -> Tensor:
+    def _share(self, parameters: Tensor, score: Tensor) -> Tensor:
         """(d, k) parameters, those of a scene's best visible instances for all if `scene_parameters`."""
         if not self.scene_parameters:
             return parameters
-        best = visibility >= self.best_visible * visibility.max()
+        best = score >= self.best_visible * score.max()
         return parameters[best].mean(0).expand_as(parameters).clone()
 
 

@@ -20,6 +20,7 @@ class SplitPlan:
         grid: "L" (part objects that training sees) or "G" (others).
         objects: whole numbers are indices into the grid, numbers like 0.7 a place in it as a share of its
             size, so that one protocol serves grids of any size; None: all of them.
+        count: instead of objects, so many of them, spread over the grid (all where it has fewer).
         first_cycle, cycles: numbers of the cycles of piles; no two splits of one grid may share one.
         clutter: share of clutter cycles, which come beside the piles, in [0, 1); training only.
     """
@@ -28,6 +29,7 @@ class SplitPlan:
     cycles: int
     first_cycle: int = 0
     objects: Sequence[int | float] | None = None
+    count: int | None = None
     clutter: float = 0.0
 
     @property
@@ -88,18 +90,19 @@ class Protocol:
         """Numbers of dropped bodies after which a scene is taken; the full bin always."""
         return list(range(self.drop_limit, 0, -self.drop_step))[::-1]
 
-    def tasks(self, grid_sizes: Mapping[str, int]) -> list[CycleTask]:
+    def tasks(self, orders: Mapping[str, Sequence[int]]) -> list[CycleTask]:
         """Every file of the data set, small splits first.
 
         Args:
-            grid_sizes: number of part objects of each grid; splits of a grid that a part lacks are left out.
+            orders: places of each grid's part objects, in the order by which `count` takes them (see
+                `spread_order`); splits of a grid that a part lacks are left out.
         """
         found = []
         for split in sorted(self.splits, key=lambda s: s == "train"):
             plan = self.splits[split]
-            if plan.grid not in grid_sizes:
+            if plan.grid not in orders:
                 continue
-            objects = self._objects(split, grid_sizes[plan.grid])
+            objects = self._objects(split, orders[plan.grid])
             for kind, count in (("pile", plan.cycles), ("clutter", plan.clutter_cycles)):
                 cycles = range(plan.first_cycle, plan.first_cycle + count)
                 found += [
@@ -107,9 +110,11 @@ class Protocol:
                 ]
         return found
 
-    def _objects(self, split: str, size: int) -> list[int]:
-        """Places of a split's part objects in a grid of `size`."""
-        plan = self.splits[split]
+    def _objects(self, split: str, order: Sequence[int]) -> list[int]:
+        """Places of a split's part objects in the grid of which `order` is a permutation."""
+        plan, size = self.splits[split], len(order)
+        if plan.count is not None:
+            return sorted(order[: plan.count])
         chosen = range(size) if plan.objects is None else plan.objects
         places = [int(place * size) if isinstance(place, float) else place for place in chosen]
         for place in places:
@@ -140,6 +145,8 @@ def _check_split(protocol: str, split: str, plan: SplitPlan) -> None:
         raise ValueError(f"{where}: grid is {plan.grid!r}, choose L or G")
     if plan.cycles < 1:
         raise ValueError(f"{where}: cycles is {plan.cycles}, expected at least 1")
+    if plan.count is not None and (plan.count < 1 or plan.objects is not None):
+        raise ValueError(f"{where}: count is {plan.count}, expected at least 1, and no objects beside it")
     if not 0 <= plan.clutter < 1:
         raise ValueError(f"{where}: clutter is {plan.clutter}, expected a share in [0, 1)")
     if plan.clutter and split != "train":

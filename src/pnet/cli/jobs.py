@@ -1,0 +1,284 @@
+"""What a sweep has to do: its cells as trainings, each of which is one run folder."""
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import yaml  # type: ignore[import-untyped]
+from hydra import compose
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf, open_dict
+
+from pnet.cli.app import key_of
+from pnet.cli.evaluate import Evaluation, wanted_evaluations
+from pnet.cli.settings import METRICS, RESOLVED, training_settings
+from pnet.cli.sweep_file import CellPlan, TablePlan
+
+RUNS = Path("outputs/train")
+
+
+@dataclass
+class Job:
+    """One training, and the evaluations that cells need of it.
+
+    Attributes:
+        overrides: of pnet-train, only those that decide something. run: its folder.
+        settings: all that the training depends on. postprocess: of the run. steps: of the training.
+        evaluations: by name. generate: overrides of pnet-generate; None where data is not made.
+        cells: which cells it serves.
+    """
+
+    overrides: tuple[str, ...]
+    run: Path
+    settings: dict[str, Any]
+    postprocess: dict[str, Any]
+    steps: int
+    generate: tuple[str, ...] | None = None
+    evaluations: dict[str, Evaluation] = field(default_factory=dict)
+    cells: list[str] = field(default_factory=list)
+
+    def missing(self) -> list[str]:
+        """What is not there yet: "training", and names of evaluations; from the run's metrics.json."""
+        metrics = read_metrics(self.run)
+        if metrics is None or int(metrics.get("steps") or 0) < self.steps:
+            return ["training", *self.evaluations]
+        return [name for name in self.evaluations if name not in metrics.get("evaluations", {})]
+
+    def command(self) -> list[str]:
+        """Overrides with which pnet-train does all of it, or what is missing."""
+        wanted = [
+            {"split": e.split, "postprocess": e.postprocess} if e.postprocess else e.split
+            for e in self.evaluations.values()
+        ]
+        added = {"evaluate": hydra_value(wanted), "run_dir": hydra_value(str(self.run)), "ckpt": "auto"}
+        if self.generate is not None:
+            added["data.generate"] = hydra_value(list(self.generate))
+        own = [word for word in self.overrides if key_of(word) not in added]
+        return [*own, *(f"{key}={value}" for key, value in added.items())]
+
+
+@dataclass(frozen=True)
+class Composed:
+    """What pnet-train would run, resolved.
+
+    Attributes:
+        settings: all that the training depends on. postprocess: the rest that results depend on.
+        run: the folder. steps: of the training; 0 for a method without one.
+        evaluations: that the overrides themselves ask for.
+    """
+
+    settings: dict[str, Any]
+    postprocess: dict[str, Any]
+    run: Path
+    steps: int
+    evaluations: tuple[Evaluation, ...]
+
+
+@lru_cache(maxsize=1024)
+def composed(overrides: tuple[str, ...]) -> Composed:
+    """What pnet-train would run with these overrides; a Hydra app must be running."""
+    cfg = compose("train", overrides=list(overrides), return_hydra_config=True)
+    outer = HydraConfig.instance().cfg
+    HydraConfig.instance().set_config(cfg)  # what ${hydra:…} refers to
+    try:
+        with open_dict(cfg):
+            del cfg["hydra"]
+        plain: Any = OmegaConf.to_container(cfg, resolve=True)
+    finally:
+        HydraConfig.instance().cfg = outer
+    steps = plain["trainer"]["steps"] if plain["method"]["estimator"] is None else 0
+    return Composed(
+        training_settings(plain),
+        plain["postprocess"],
+        Path(plain["run_dir"]),
+        int(steps),
+        tuple(wanted_evaluations(plain["evaluate"])),
+    )
+
+
+def expand(arguments: Sequence[str]) -> list[list[str]]:
+    """All combinations of overrides with several values (`seed=0,1`), in Hydra's order.
+
+    Raises:
+        ValueError: for a sweep over a range that is not a list of values.
+    """
+    choices: dict[str, list[str]] = {}
+    for override in OverridesParser.create().parse_overrides(list(arguments)):
+        key = override.get_key_element()
+        if not override.is_sweep_override():
+            choices[key] = [f"{key}={override.get_value_element_as_str()}"]
+        elif override.is_discrete_sweep():
+            choices[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
+        else:
+            raise ValueError(f"{override.input_line}: give the values one by one, with commas")
+    return [list(words) for words in product(*choices.values())]
+
+
+def plain_jobs(arguments: Sequence[str]) -> list[Job]:
+    """A job for each combination of a multirun without a sweep file."""
+    index = RunIndex(RUNS)
+    jobs: dict[Path, Job] = {}
+    for words in expand(arguments):
+        job = make_job(tuple(words), index)
+        jobs.setdefault(job.run, job)
+    return list(jobs.values())
+
+
+def sweep_jobs(tables: Sequence[TablePlan], arguments: Sequence[str]) -> list[Job]:
+    """The jobs of a sweep: cells that train the same thing share one, whatever table they stand in."""
+    index = RunIndex(RUNS)
+    jobs: list[Job] = []
+    for words in expand(arguments):
+        for table in tables:
+            for cell, overrides in restricted(table, words):
+                job = make_job(overrides, index, jobs, own_data(overrides, cell))
+                add_cell(job, cell, overrides)
+    return jobs
+
+
+def restricted(table: TablePlan, words: Sequence[str]) -> Iterator[tuple[CellPlan, tuple[str, ...]]]:
+    """A table's cells with their overrides and the user's; the user's value of a key that the table itself
+    sweeps selects cells (`part=tn34`)."""
+    own_keys = {key_of(word) for cell in table.cells() for word in cell.overrides}
+    further = [word for word in words if key_of(word) not in own_keys]
+    chosen = [word for word in words if key_of(word) in own_keys]
+    for cell in table.cells():
+        if all(word in cell.overrides for word in chosen):
+            yield cell, (*further, *cell.overrides)
+
+
+def make_job(
+    overrides: tuple[str, ...],
+    index: "RunIndex",
+    known: list[Job] | None = None,
+    generate: tuple[str, ...] | None = None,
+) -> Job:
+    """The job of overrides: one that is known, or a new one, put to the known.
+
+    A run that is there with the same settings is taken, whatever its name; else the folder is named by the
+    overrides that change what is trained.
+    """
+    whole = composed(overrides)
+    for job in known or ():
+        if job.settings == whole.settings:
+            return job
+    run = index.find(whole.settings)
+    named = tuple(overrides) if given_folder(overrides) else deciding(overrides, whole.settings)
+    if run is None:
+        run = composed(named).run
+    trained_with = index.postprocess.get(run, composed(named).postprocess)
+    asked = {evaluation.name: evaluation for evaluation in whole.evaluations}
+    job = Job(named, run, whole.settings, trained_with, whole.steps, generate, asked)
+    if known is not None:
+        known.append(job)
+    return job
+
+
+def own_data(overrides: Iterable[str], cell: CellPlan) -> tuple[str, ...] | None:
+    """With which settings a cell's data is made; None where the user names a data set that is there."""
+    return None if any(key_of(word) == "data.root" for word in overrides) else cell.generate
+
+
+def given_folder(overrides: Iterable[str]) -> bool:
+    """Whether the user names the run's folder himself."""
+    return any(key_of(word) == "run_dir" for word in overrides)
+
+
+def deciding(overrides: Sequence[str], settings: dict[str, Any]) -> tuple[str, ...]:
+    """The overrides without those whose absence changes nothing of the training; part and protocol stay."""
+    kept = list(overrides)
+    for word in overrides:
+        rest = [other for other in kept if other != word]
+        if key_of(word) in ("part", "protocol", "data.root"):
+            continue
+        if composed(tuple(rest)).settings == settings:
+            kept = rest
+    return tuple(kept)
+
+
+def add_cell(job: Job, cell: CellPlan, overrides: Sequence[str]) -> str:
+    """Have a job serve a cell; the name of the evaluation that is the cell's."""
+    evaluation = cell_evaluation(job.postprocess, cell, composed(tuple(overrides)).postprocess)
+    job.evaluations.setdefault(evaluation.name, evaluation)
+    if cell.name not in job.cells:
+        job.cells.append(cell.name)
+    return evaluation.name
+
+
+def cell_evaluation(trained: dict[str, Any], cell: CellPlan, wanted: dict[str, Any]) -> Evaluation:
+    """How a run with one post-processing is scored for a cell that wants another."""
+    changes = changed(trained, wanted)
+    return Evaluation(cell.table.split, wanted if changes is None else changes)
+
+
+def changed(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any] | None:
+    """What has to be merged into old settings to make them new; None where merging cannot."""
+    if set(old) - set(new):
+        return None
+    changes: dict[str, Any] = {}
+    for key, value in new.items():
+        if key in old and old[key] == value:
+            continue
+        if isinstance(value, dict) and isinstance(old.get(key), dict):
+            inner = changed(old[key], value)
+            if inner is None:
+                return None
+            changes[key] = inner
+        else:
+            changes[key] = value
+    return changes
+
+
+class RunIndex:
+    """The runs below a folder, by their settings.
+
+    Attributes:
+        postprocess: of each run.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.postprocess: dict[Path, dict[str, Any]] = {}
+        self.settings: dict[Path, dict[str, Any]] = {}
+        for path in sorted(folder.glob(f"*/{RESOLVED}")):
+            try:
+                content = yaml.load(path.read_text(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+                self.settings[path.parent] = training_settings(content)
+                self.postprocess[path.parent] = content["postprocess"]
+            except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError, AttributeError):
+                continue  # of another version, or damaged: not ours to judge
+
+    def find(self, settings: dict[str, Any]) -> Path | None:
+        """The run with these settings."""
+        return next((run for run, own in self.settings.items() if own == settings), None)
+
+
+def read_metrics(run: Path) -> dict[str, Any] | None:
+    """A run's metrics.json; None where it is not there or damaged."""
+    try:
+        content = json.loads((run / METRICS).read_text())
+    except (OSError, ValueError):
+        return None
+    return content if isinstance(content, dict) else None
+
+
+def hydra_value(value: Any) -> str:
+    """Plain values as an override's right side."""
+    match value:
+        case None:
+            return "null"
+        case bool():
+            return str(value).lower()
+        case dict():
+            return "{" + ",".join(f"{key}:{hydra_value(item)}" for key, item in value.items()) + "}"
+        case list() | tuple():
+            return "[" + ",".join(map(hydra_value, value)) + "]"
+        case str():
+            escaped = value.replace("\\", "\\\\").replace("'", "\\'")
+            return f"'{escaped}'"
+        case _:
+            return repr(value)

@@ -1,0 +1,94 @@
+"""`--multirun`: which jobs there are, which are done, and how the rest ended."""
+
+import sys
+from collections.abc import Sequence
+from statistics import median
+
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.plugins.launcher import Launcher
+from rich.console import Console
+from rich.table import Table
+
+from pnet.cli.app import key_of
+from pnet.cli.jobs import RUNS, Job, plain_jobs, read_metrics, sweep_jobs
+from pnet.cli.settings import recipe_text
+from pnet.cli.sweep_file import read_sweep
+
+SWEEP, DRY_RUN = "sweep", "dry_run"
+
+
+def sweep(arguments: Sequence[str], launcher: Launcher) -> list[JobReturn]:
+    """Run the jobs that are not done.
+
+    Args:
+        arguments: the command's overrides, among them `sweep=` and `dry_run=`.
+        launcher: Hydra's, by hydra/launcher.
+    Raises:
+        SystemExit: with code 1 where a job failed; all are listed with their reasons.
+    """
+    jobs = planned_jobs(arguments)
+    missing = [job for job in jobs if job.missing()]
+    out = Console(soft_wrap=True)
+    dry = any(word in (f"{DRY_RUN}=true", f"{DRY_RUN}=True") for word in arguments)
+    if dry:
+        out.print(job_table(jobs))
+    out.print(
+        f"{len(jobs)} jobs: {len(jobs) - len(missing)} done, {len(missing)} missing; {estimate(missing)}"
+    )
+    if dry or not missing:
+        return []
+    reasons, returns = launch(missing, launcher)
+    failed = {job.run: reasons.get(i, "not done") for i, job in enumerate(missing) if job.missing()}
+    out.print(f"\n{len(jobs) - len(failed)} of {len(jobs)} jobs done")
+    for run, reason in failed.items():
+        out.print(f"FAILED {run}: {reason}", style="red", markup=False)
+    if failed:
+        print("the same command runs again what failed", file=sys.stderr)
+        sys.exit(1)
+    return returns
+
+
+def planned_jobs(arguments: Sequence[str]) -> list[Job]:
+    """The jobs of a multirun's overrides."""
+    named = [word.split("=", 1)[1] for word in arguments if key_of(word) == SWEEP]
+    further = [word for word in arguments if key_of(word) not in (SWEEP, DRY_RUN)]
+    return sweep_jobs(read_sweep(named[-1]), further) if named else plain_jobs(further)
+
+
+def launch(jobs: Sequence[Job], launcher: Launcher) -> tuple[dict[int, str], list[JobReturn]]:
+    """Run jobs; the reasons of those that failed, by number. A launcher's own failure is every job's."""
+    try:
+        returns = list(launcher.launch([job.command() for job in jobs], initial_job_idx=0))
+    except Exception as fault:  # of a launcher that is not ours: which jobs are done is seen in their folders
+        reason = " ".join(str(fault).split()) or type(fault).__name__
+        return dict.fromkeys(range(len(jobs)), reason), []
+    failed = [(i, found) for i, found in enumerate(returns) if found.status is JobStatus.FAILED]
+    return {i: " ".join(str(found._return_value).split()) for i, found in failed}, returns
+
+
+def job_table(jobs: Sequence[Job]) -> Table:
+    """Every job with its folder, the tables that it serves and what is missing of it."""
+    table = Table("run", "serves", "missing", box=None, padding=(0, 2, 0, 0))
+    for job in jobs:
+        serves = ", ".join(dict.fromkeys(name.split(":")[0] for name in job.cells))
+        table.add_row(job.run.name, serves, ", ".join(job.missing()) or "done")
+    return table
+
+
+def estimate(missing: Sequence[Job]) -> str:
+    """How long the missing trainings will take, by the runs of their protocol that have ended."""
+    known: dict[str, list[float]] = {}
+    for path in RUNS.glob("*/metrics.json"):
+        metrics = read_metrics(path.parent) or {}
+        name, seconds, steps = (metrics.get(key) for key in ("recipe", "training_seconds", "steps"))
+        if name and seconds and steps:
+            known.setdefault(str(name), []).append(float(seconds) / int(steps))
+    total = 0.0
+    for job in missing:
+        if "training" not in job.missing():
+            continue
+        pace = known.get(recipe_text(job.settings))
+        if pace is None:
+            return "no run of this kind has ended yet, so no estimate of the time"
+        total += median(pace) * job.steps
+    return f"about {total / 3600:.1f} h of training" if missing else "nothing to do"
