@@ -254,7 +254,12 @@ class RunIndex:
 
     def find(self, settings: dict[str, Any]) -> Path | None:
         """The run with these settings."""
-        return next((run for run, own in self.settings.items() if own == settings), None)
+        return next(iter(self.matching(settings, any_seed=False)), None)
+
+    def matching(self, settings: dict[str, Any], any_seed: bool) -> list[Path]:
+        """The runs with these settings, whatever their seed or with this one."""
+        free = {"seed": None} if any_seed else {}
+        return [run for run, own in self.settings.items() if {**own, **free} == {**settings, **free}]
 
 
 def read_metrics(run: Path) -> dict[str, Any] | None:

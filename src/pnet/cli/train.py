@@ -11,7 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from pnet.cli.app import run_app
-from pnet.cli.evaluate import Evaluation, is_current, predict, score, wanted_evaluations
+from pnet.cli.evaluate import Evaluation, is_current, open_scenes, predict, score, wanted_evaluations
 from pnet.cli.settings import (
     CONFIG,
     METRICS,
@@ -153,7 +153,12 @@ def with_evaluations(metrics: dict[str, Any], evaluations: list[Evaluation], run
             predict(evaluation, run)
             score(evaluation, run, trained)
         found = read_json(evaluation.folder(run) / METRICS)
-        done[evaluation.name] = {"split": evaluation.split, "postprocess": evaluation.postprocess, **found}
+        done[evaluation.name] = {
+            "split": evaluation.split,
+            "postprocess": evaluation.postprocess,
+            "data": open_scenes(evaluation, trained)[1],
+            **found,
+        }
     return {**metrics, "evaluations": done}
 
 
