@@ -4,8 +4,10 @@ import difflib
 import os
 import re
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from hashlib import sha256
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -23,6 +25,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from pnet.cli.instantiate import trusted_modules
 
 Task = Callable[[DictConfig], None]
+LAUNCHERS = {"submitit": ("slurm", "hydra_submitit_launcher"), "ray": ("ray", "hydra_ray_launcher")}
 LONGEST_NAME = 120  # of a folder, in characters
 # what a user can mend; anything else is a fault of ours and keeps its traceback
 EXPECTED = (ValueError, OSError, ModuleNotFoundError, HydraException, OmegaConfBaseException)
@@ -41,6 +44,24 @@ def config_dir() -> Path:
 def key_of(override: str) -> str:
     """The key of an override such as +a.b=1."""
     return override.split("=", 1)[0].lstrip("+~")
+
+
+def hydra_value(value: Any) -> str:
+    """Plain values as an override's right side."""
+    match value:
+        case None:
+            return "null"
+        case bool():
+            return str(value).lower()
+        case dict():
+            return "{" + ",".join(f"{key}:{hydra_value(item)}" for key, item in value.items()) + "}"
+        case list() | tuple():
+            return "[" + ",".join(map(hydra_value, value)) + "]"
+        case str():
+            escaped = value.replace("\\", "\\\\").replace("'", "\\'")
+            return f"'{escaped}'"
+        case _:
+            return repr(value)
 
 
 def run_name(*words: str) -> str:
@@ -63,6 +84,7 @@ OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 def run_app(task: Task, config_name: str) -> None:
     """Run a command: compose its config, call the task, turn errors into one line and an exit code."""
     try:
+        _check_launcher(sys.argv[1:])
         if trusted_modules():  # modules of the user's own may lie in the working directory
             sys.path.append(os.getcwd())
         folder = config_dir()
@@ -120,6 +142,21 @@ def _guarded(task: Task) -> Task:
             fail(fault)
 
     return guarded
+
+
+def _check_launcher(arguments: list[str]) -> None:
+    """Say which extra a launcher of a cluster is in, where it is not installed; Hydra would list files."""
+    # ours adds a GPU, a time limit and queueing again to the plugin's own settings of the same name
+    warnings.filterwarnings(
+        "ignore", message=".*hydra/launcher/submitit_slurm' is validated", category=UserWarning
+    )
+    for word in arguments:
+        name = word.partition("hydra/launcher=")[2]
+        for prefix, (extra, plugin) in LAUNCHERS.items():
+            if name.startswith(prefix) and find_spec(f"hydra_plugins.{plugin}") is None:
+                raise ModuleNotFoundError(
+                    f'hydra/launcher={name} needs an extra: pip install "pnet[{extra}]"'
+                )
 
 
 def _explain_bad_overrides(folder: Path, config_name: str, arguments: list[str]) -> None:

@@ -1,5 +1,6 @@
 """pnet-generate: make a data set."""
 
+import json
 import os
 from collections import Counter
 from pathlib import Path
@@ -29,6 +30,8 @@ def generate_data(cfg: DictConfig) -> None:
     """Make what is missing of the data set, with a progress bar and a summary."""
     from pnet.engine.locks import hold
 
+    if cfg.like is not None:
+        cfg = like(cfg)
     settings = making_settings(cfg)
     factory = build_factory(cfg, settings)
     tasks = plan_tasks(
@@ -37,6 +40,19 @@ def generate_data(cfg: DictConfig) -> None:
     root = Path(cfg.data.root)
     with hold(root, f"another process makes {root}"):
         make_missing(cfg, factory, manifest_of(settings, tasks), tasks, root)
+
+
+def like(cfg: DictConfig) -> DictConfig:
+    """The settings that made another data set, with this one's folder and workers."""
+    path = Path(cfg.like)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; like= takes a dataset.json")
+    try:
+        made = {key: json.loads(path.read_text())[key] for key in MAKING}
+    except (ValueError, KeyError, TypeError) as fault:
+        raise ValueError(f"{path}: not a data set's manifest ({fault})") from fault
+    rest = {key: cfg[key] for key in ("data", "workers")}
+    return OmegaConf.create({**made, **rest})
 
 
 def make_missing(

@@ -14,7 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf, open_dict
 
-from pnet.cli.app import key_of
+from pnet.cli.app import hydra_value, key_of
 from pnet.cli.evaluate import Evaluation, wanted_evaluations
 from pnet.cli.settings import METRICS, RESOLVED, training_settings
 from pnet.cli.sweep_file import CellPlan, TablePlan
@@ -269,21 +269,3 @@ def read_metrics(run: Path) -> dict[str, Any] | None:
     except (OSError, ValueError):
         return None
     return content if isinstance(content, dict) else None
-
-
-def hydra_value(value: Any) -> str:
-    """Plain values as an override's right side."""
-    match value:
-        case None:
-            return "null"
-        case bool():
-            return str(value).lower()
-        case dict():
-            return "{" + ",".join(f"{key}:{hydra_value(item)}" for key, item in value.items()) + "}"
-        case list() | tuple():
-            return "[" + ",".join(map(hydra_value, value)) + "]"
-        case str():
-            escaped = value.replace("\\", "\\\\").replace("'", "\\'")
-            return f"'{escaped}'"
-        case _:
-            return repr(value)

@@ -9,7 +9,16 @@ from omegaconf import DictConfig, OmegaConf
 CONFIG = "config.yaml"  # a run's settings as they were given, interpolations and all
 RESOLVED = "resolved.yaml"  # the same, resolved: what evaluation reads
 METRICS = "metrics.json"  # written last: with it a run is done
-DECIDE_NOTHING = ("ckpt", "run_dir", "evaluate", "sweep", "dry_run", "data.generate", "trainer.threads")
+DECIDE_NOTHING = (
+    "ckpt",
+    "run_dir",
+    "repeat",
+    "evaluate",
+    "sweep",
+    "dry_run",
+    "data.generate",
+    "trainer.threads",
+)
 
 
 def training_settings(run: DictConfig | dict[str, Any]) -> dict[str, Any]:

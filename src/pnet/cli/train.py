@@ -1,5 +1,6 @@
 """pnet-train: train a network on a data set."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from pnet.cli.app import run_app
+from pnet.cli.app import hydra_value, key_of, run_app
 from pnet.cli.evaluate import Evaluation, is_current, open_scenes, predict, score, wanted_evaluations
 from pnet.cli.settings import (
     CONFIG,
@@ -40,10 +41,17 @@ def train(cfg: DictConfig) -> None:
 
     if cfg.sweep is not None:
         raise ValueError(f"sweep={cfg.sweep} declares several trainings: add --multirun")
+    if cfg.repeat is not None:
+        cfg = repeated(cfg)
     run = Path(cfg.run_dir)
+    if is_helper():
+        fit(cfg, run)
+        return
     evaluations = wanted_evaluations(OmegaConf.to_container(cfg.evaluate, resolve=True))
     with hold(run, f"another process works on {run}"):
-        if cfg.data.generate is not None:
+        if cfg.repeat is not None:
+            make_data_again(cfg)
+        elif cfg.data.generate is not None:
             make_data(cfg)
         if is_trained(cfg):
             metrics = fit(cfg, run)
@@ -108,10 +116,12 @@ def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
             check_same_settings(run, cfg)
         if is_finished(run, cfg.trainer.steps):
             return read_json(run / METRICS)
-    begin_run(cfg, run)
+    if not is_helper():
+        begin_run(cfg, run)
     full = validation[len(validation) - 1]  # cycles end with a full bin
     summary = summarise(parts.network, torch.from_numpy(full.points[: cfg.data.points]))
-    print(summary)
+    if not is_helper():
+        print(summary)
     add_settings(trainer.logger.experiment, OmegaConf.to_yaml(cfg))  # type: ignore[union-attr]
     try:
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
@@ -126,13 +136,21 @@ def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
     }
 
 
+def is_helper() -> bool:
+    """Whether Lightning started this process to train along with the first (trainer.devices > 1)."""
+    return int(os.environ.get("LOCAL_RANK", "0")) > 0
+
+
 def begin_run(cfg: DictConfig, run: Path) -> None:
     """Write what the run is made of; metrics.json of an earlier one goes."""
     from pnet.engine.provenance import provenance, write_json
+    from pnet.scenes.generation import MANIFEST, read_manifest
     from pnet.scenes.store import write_atomically
 
+    data = read_manifest(Path(cfg.data.root))
     run.mkdir(parents=True, exist_ok=True)
     (run / METRICS).unlink(missing_ok=True)
+    write_json(run / MANIFEST, data)  # how the data was made, so that the folder is enough to repeat the run
     write_atomically(run / CONFIG, OmegaConf.to_yaml(cfg).encode())
     write_atomically(run / RESOLVED, OmegaConf.to_yaml(cfg, resolve=True).encode())
     write_json(run / "provenance.json", provenance(cfg.seed))
@@ -171,6 +189,39 @@ def finish(cfg: DictConfig, run: Path, metrics: dict[str, Any]) -> None:
     write_json(run / METRICS, metrics)
 
 
+def repeated(cfg: DictConfig) -> DictConfig:
+    """The settings of the run `repeat`, into another folder, with as many threads as it had."""
+    from pnet.engine.provenance import git_state, read_json
+
+    old = Path(cfg.repeat)
+    again = read_run(old).copy()
+    state = read_json(old / "provenance.json")
+    commit = git_state(Path(__file__).parent)["commit"]
+    if state["git"]["commit"] != commit:
+        print(
+            f"{old} was trained with commit {state['git']['commit'][:7]}, this is {commit[:7]}",
+            file=sys.stderr,
+        )
+    given = any(key_of(word) == "run_dir" for word in HydraConfig.get().overrides.task)
+    again.run_dir = cfg.run_dir if given else f"{str(old).rstrip('/')}_again"
+    again.ckpt, again.repeat = cfg.ckpt, cfg.repeat
+    again.trainer.threads = state["threads"]
+    return again
+
+
+def make_data_again(cfg: DictConfig) -> None:
+    """Have the data of the run `repeat` made where it is gone; other data in its place is an error."""
+    from pnet.scenes.generation import MANIFEST, read_manifest, settings_fingerprint
+
+    root, manifest = Path(cfg.data.root), Path(cfg.repeat) / MANIFEST
+    if not (root / MANIFEST).exists():
+        run_generate([f"like={hydra_value(str(manifest))}", f"data.root={hydra_value(str(root))}"], root)
+    elif settings_fingerprint(read_manifest(root)) != settings_fingerprint(read_manifest(manifest.parent)):
+        raise ValueError(
+            f"{root}: holds other data than {cfg.repeat} was trained on; move it away and try again"
+        )
+
+
 def make_data(cfg: DictConfig) -> None:
     """Have pnet-generate make what is missing of the data set, in a process of its own."""
     from pnet.cli.generate import is_complete
@@ -180,11 +231,14 @@ def make_data(cfg: DictConfig) -> None:
         word for word in chosen if word.lstrip("+").startswith(("part=", "part.", "protocol=", "protocol."))
     ]
     overrides = [*kept, f"data.root={cfg.data.root}", *cfg.data.generate]
-    if is_complete(compose("generate", overrides=overrides)):
-        return
-    done = subprocess.run([sys.executable, "-m", "pnet.cli.generate", *overrides])
-    if done.returncode:
-        raise ValueError(f"{cfg.data.root}: the scenes could not be made, see above")
+    if not is_complete(compose("generate", overrides=overrides)):
+        run_generate(overrides, cfg.data.root)
+
+
+def run_generate(overrides: list[str], root: Path) -> None:
+    """pnet-generate in a process of its own; its output stays where this one's goes."""
+    if subprocess.run([sys.executable, "-m", "pnet.cli.generate", *overrides]).returncode:
+        raise ValueError(f"{root}: the scenes could not be made, see above")
 
 
 def quiet_lightning() -> None:
@@ -246,8 +300,8 @@ def build_trainer(cfg: DictConfig, run: Path, callbacks: list["lightning.Callbac
     from lightning.pytorch.loggers import TensorBoardLogger
 
     options = cfg.trainer
-    if options.devices != 1:
-        raise ValueError(f"trainer.devices is {options.devices}: training runs on one device, set it to 1")
+    if not isinstance(options.devices, int) or options.devices < 1:
+        raise ValueError(f"trainer.devices is {options.devices}, expected a number of at least 1")
     if options.validate_every % options.checkpoint_every:
         raise ValueError(
             f"trainer.validate_every ({options.validate_every}) must be a multiple of "
@@ -261,6 +315,8 @@ def build_trainer(cfg: DictConfig, run: Path, callbacks: list["lightning.Callbac
     return lightning.Trainer(
         accelerator=options.accelerator,
         devices=options.devices,
+        strategy="ddp" if options.devices > 1 else "auto",
+        use_distributed_sampler=False,  # EpochSampler shares the scenes out itself
         # counted in epochs: with max_steps Lightning skips an epoch when it resumes at an epoch's end
         max_epochs=options.steps // options.checkpoint_every,
         check_val_every_n_epoch=options.validate_every // options.checkpoint_every,

@@ -87,10 +87,12 @@ class EpochSampler(Sampler[Draw]):
 
     Args:
         size: how many scenes there are. draws: how many make an epoch; None: each scene once.
+        rank, world: of several processes that train together, each takes every `world`-th of world * draws.
     """
 
-    def __init__(self, size: int, seed: int, draws: int | None = None) -> None:
+    def __init__(self, size: int, seed: int, draws: int | None = None, rank: int = 0, world: int = 1) -> None:
         self._size, self._seed, self._draws = size, seed, draws or size
+        self._rank, self._world = rank, world
         self._epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
@@ -102,8 +104,10 @@ class EpochSampler(Sampler[Draw]):
 
     def __iter__(self) -> Iterator[Draw]:
         # an endless row of permutations, cut into epochs, so that every scene is seen equally often
-        for position in range(self._epoch * self._draws, (self._epoch + 1) * self._draws):
+        drawn = self._draws * self._world
+        known = -1
+        for position in range(self._epoch * drawn + self._rank, (self._epoch + 1) * drawn, self._world):
             turn, place = divmod(position, self._size)
-            if place == 0 or position == self._epoch * self._draws:
-                order = np.random.default_rng([self._seed, turn]).permutation(self._size)
+            if turn != known:
+                order, known = np.random.default_rng([self._seed, turn]).permutation(self._size), turn
             yield int(order[place]), self._epoch

@@ -114,7 +114,8 @@ class SceneDataModule(lightning.LightningDataModule):
                 f"data.batch_size is {self._batch_size}, but an epoch has only "
                 f"{self._draws or len(scenes)} scenes; lower it or make more scenes"
             )
-        sampler = EpochSampler(len(scenes), self._seed, self._draws)
+        rank, world = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+        sampler = EpochSampler(len(scenes), self._seed, self._draws, rank, world)
         return self._loader(dataset, sampler, drop_last=True)
 
     def val_dataloader(self) -> DataLoader[Any]:

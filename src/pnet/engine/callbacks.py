@@ -93,7 +93,7 @@ class Throughput(lightning.Callback):
     ) -> None:
         """Count a batch; the time includes loading the next one."""
         now = perf_counter()
-        size = len(batch.points)  # type: ignore[attr-defined]
+        size = len(batch.points) * trainer.world_size  # type: ignore[attr-defined]
         self.scenes += size
         if self._start is not None:
             pl_module.log("train/scenes_per_second", size / (now - self._start), prog_bar=True)

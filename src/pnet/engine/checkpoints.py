@@ -32,8 +32,9 @@ class ResumableCheckpoint(Checkpoint):
         self._folder.mkdir(parents=True, exist_ok=True)
         temporary = self._folder / f".{NAME}.part"
         try:
-            trainer.save_checkpoint(temporary)
-            os.replace(temporary, self.path)
+            trainer.save_checkpoint(temporary)  # every process calls it, the first writes
+            if trainer.is_global_zero:
+                os.replace(temporary, self.path)
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise

@@ -32,7 +32,7 @@ class PoseMetrics(Metric):
     truths_to_find, results, scenes.
 
     Note:
-        For a single process: gathering over processes would join the scenes of each.
+        Each process counts its own scenes; nothing is gathered, where several train together each sees all.
     """
 
     is_differentiable = False
@@ -44,7 +44,7 @@ class PoseMetrics(Metric):
         Args:
             max_occlusion: a true pose that is more occluded than this counts neither way.
         """
-        super().__init__()
+        super().__init__(sync_on_compute=False)
         self.max_occlusion = max_occlusion
         for name in _FIELDS + _ERRORS:
             self.add_state(name, default=[], dist_reduce_fx=None)
