@@ -168,19 +168,24 @@ def _explain_bad_overrides(folder: Path, config_name: str, arguments: list[str])
     overrides = OverridesParser.create().parse_overrides(words)
     GlobalHydra.instance().clear()
     with initialize_config_dir(str(folder), version_base="1.3"):
-        good: list[str] = []
-        for override in overrides:
-            if (override.key_or_group or "").startswith("hydra"):
-                continue
-            trial = _first_choice(override)
-            if trial is None:
-                continue
-            try:
-                compose(config_name, overrides=[*good, trial], return_hydra_config=True)
-            except (HydraException, OmegaConfBaseException) as fault:
-                raise ValueError(_hint(folder, config_name, override, good, fault)) from fault
-            good.append(trial)
+        own = [o for o in overrides if not (o.key_or_group or "").startswith("hydra")]
+        trials = [(override, trial) for override in own if (trial := _first_choice(override)) is not None]
+        try:  # most often all is well, and composing takes a tenth of a second
+            compose(config_name, overrides=[trial for _, trial in trials], return_hydra_config=True)
+        except (HydraException, OmegaConfBaseException):
+            _explain_first(folder, config_name, trials)
     GlobalHydra.instance().clear()
+
+
+def _explain_first(folder: Path, config_name: str, trials: list[tuple[Override, str]]) -> None:
+    """Raise ValueError about the first override with which composing fails."""
+    good: list[str] = []
+    for override, trial in trials:
+        try:
+            compose(config_name, overrides=[*good, trial], return_hydra_config=True)
+        except (HydraException, OmegaConfBaseException) as fault:
+            raise ValueError(_hint(folder, config_name, override, good, fault)) from fault
+        good.append(trial)
 
 
 def _first_choice(override: Override) -> str | None:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -77,6 +78,15 @@ def share(value: object) -> float:
         raise ValueError(f"data.learn is {value!r}, expected a share in (0, 1], for instance 1/3") from None
 
 
+@lru_cache
+def part_name(part: str) -> str:
+    """The name of the template that a part's settings (YAML) make; to make one takes a while."""
+    settings = OmegaConf.create(part)
+    assert isinstance(settings, DictConfig)
+    name: str = instantiate(settings).name
+    return name
+
+
 def identity(cfg: DictConfig) -> dict[str, str]:
     """What weights belong to: part, network and labels, as text that can be compared."""
     part = {key: value for key, value in cfg.part.items() if key not in UNLEARNT}
@@ -87,7 +97,11 @@ def identity(cfg: DictConfig) -> dict[str, str]:
         "targets": cfg.data.targets,
     }
     texts = {name: OmegaConf.to_yaml(node, resolve=True) for name, node in groups.items()}
-    return {"part": instantiate(cfg.part).name, "points": str(cfg.data.points), **texts}
+    return {
+        "part": part_name(OmegaConf.to_yaml(cfg.part, resolve=True)),
+        "points": str(cfg.data.points),
+        **texts,
+    }
 
 
 def device_of(accelerator: str) -> str:

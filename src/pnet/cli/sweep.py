@@ -1,13 +1,12 @@
 """`--multirun`: which jobs there are, which are done, and how the rest ended."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from statistics import median
 
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
 from rich.console import Console
-from rich.table import Table
 
 from pnet.cli.app import key_of
 from pnet.cli.jobs import RUNS, Job, plain_jobs, read_metrics, sweep_jobs
@@ -31,7 +30,7 @@ def sweep(arguments: Sequence[str], launcher: Launcher) -> list[JobReturn]:
     out = Console(soft_wrap=True)
     dry = any(word in (f"{DRY_RUN}=true", f"{DRY_RUN}=True") for word in arguments)
     if dry:
-        out.print(job_table(jobs))
+        out.print(f"runs in {RUNS}:", *job_lines(jobs), sep="\n", markup=False, highlight=False)
     out.print(
         f"{len(jobs)} jobs: {len(jobs) - len(missing)} done, {len(missing)} missing; {estimate(missing)}"
     )
@@ -66,17 +65,19 @@ def launch(jobs: Sequence[Job], launcher: Launcher) -> tuple[dict[int, str], lis
     return {i: " ".join(str(found._return_value).split()) for i, found in failed}, returns
 
 
-def job_table(jobs: Sequence[Job]) -> Table:
-    """Every job with its folder, the tables that it serves and what is missing of it."""
-    table = Table("run", "serves", "missing", box=None, padding=(0, 2, 0, 0))
+def job_lines(jobs: Sequence[Job]) -> Iterator[str]:
+    """Every job with the tables that it serves and what is missing of it."""
+    width = max(len(job.run.name) for job in jobs)
     for job in jobs:
         serves = ", ".join(dict.fromkeys(name.split(":")[0] for name in job.cells))
-        table.add_row(job.run.name, serves, ", ".join(job.missing()) or "done")
-    return table
+        missing = ", ".join(job.missing()) or "done"
+        yield f"{job.run.name:<{width}}  {serves + ': ' if serves else ''}{missing}"
 
 
 def estimate(missing: Sequence[Job]) -> str:
     """How long the missing trainings will take, by the runs of their protocol that have ended."""
+    from pnet.reporting.paper_table import duration_text
+
     known: dict[str, list[float]] = {}
     for path in RUNS.glob("*/metrics.json"):
         metrics = read_metrics(path.parent) or {}
@@ -91,4 +92,4 @@ def estimate(missing: Sequence[Job]) -> str:
         if pace is None:
             return "no run of this kind has ended yet, so no estimate of the time"
         total += median(pace) * job.steps
-    return f"about {total / 3600:.1f} h of training" if missing else "nothing to do"
+    return f"about {duration_text(total)} of training" if missing else "nothing to do"
