@@ -5,11 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
+from tests.conftest import load_part
 
 from pnet.data.augmentation import rotate_about_view_axis
-from pnet.data.targets import instance_keypoints, point_labels
+from pnet.data.targets import instance_keypoints, point_labels, pose_labels, pose_scale
 from pnet.geometry.camera import Camera
+from pnet.geometry.symmetry import FiniteSymmetry, RevolutionSymmetry, SphericalSymmetry
+from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointChoice, KeypointRule
+from pnet.parts.primitives import Sphere
+from pnet.parts.selection import Keypoint
+from pnet.parts.shapes import Ball
 from pnet.parts.tn16 import TN16
 from pnet.parts.tn42 import TN42
 from pnet.records import Scene, SceneId
@@ -200,3 +207,112 @@ def test_point_labels_of_sixty_bodies_are_those_of_trying_every_place(pile):
             chosen[name] = places[np.argmin(distance)]
             step = 2e-3 * scene.parameters[i].max() if len(places) == len(CIRCLE) else 1e-6
             assert np.linalg.norm(scene.R[i] @ chosen[name] + scene.t[i] - found) < step, (n, name)
+
+
+class Marble(ParametricPart):
+    """Every rotation is a symmetry."""
+
+    name = "marble"
+    parameter_names = ("r",)
+    symmetry = SphericalSymmetry()
+    keypoints = (Keypoint("surface", "centroid", Sphere(), "r"),)
+
+    def solid(self, parameters):
+        return Ball(self.split(parameters)[0])
+
+
+def rotations(n: int, seed: int) -> torch.Tensor:
+    return torch.from_numpy(Rotation.random(n, seed).as_matrix())
+
+
+def distances(part, size: np.ndarray, Ra: torch.Tensor, Rb: torch.Tensor) -> torch.Tensor:
+    """The benchmark's, of bodies whose surface centroids lie at one place."""
+    space = part.pose_space(size)
+    return space.distance(Ra, -Ra @ space.centre, Rb, -Rb @ space.centre)
+
+
+@pytest.mark.parametrize("name", ["tn06", "tn42", "knob", "tless20"])
+@pytest.mark.parametrize("index", [0, -1])
+def test_rotations_differ_by_the_benchmarks_distance(name, index):
+    """Of finite symmetries, over whose elements the least counts."""
+    part = load_part(name)
+    assert isinstance(part.symmetry, FiniteSymmetry)
+    size = part.grids["L"][index]
+    Ra, Rb = rotations(40, 0), rotations(40, 1)
+    others = Rb[:, None] @ part.symmetry.rotations
+    found = ((Ra[:, None] - others) @ pose_scale(part, size)).norm(dim=(-2, -1)).amin(1)
+    torch.testing.assert_close(found, distances(part, size, Ra, Rb), rtol=0, atol=1e-12)
+    assert float(found.min()) > 0.0001
+
+
+@pytest.mark.parametrize(("name", "ends"), [("tn34", (1,)), ("tn16", (1, -1)), ("gear", (1,))])
+def test_axes_of_revolutions_differ_by_the_benchmarks_distance(name, ends):
+    part = load_part(name)
+    assert isinstance(part.symmetry, RevolutionSymmetry)
+    size = part.grids["L"][-1]
+    scale = pose_scale(part, size)
+    assert torch.equal(scale, scale[0, 0] * torch.eye(3, dtype=torch.float64))
+    assert float(scale[0, 0]) == float(part.pose_space(size).scale) > 0.003
+    Ra, Rb = rotations(40, 0), rotations(40, 1)
+    found = torch.stack([((Ra[..., 2] - end * Rb[..., 2]) @ scale).norm(dim=-1) for end in ends])
+    torch.testing.assert_close(found.amin(0), distances(part, size, Ra, Rb), rtol=0, atol=1e-12)
+
+
+def test_turning_a_sphere_moves_nothing():
+    part = Marble({"r": [8, 11]})
+    scale = pose_scale(part, part.part_object("L", 1))
+    assert scale.shape == (3, 3) and scale.dtype == torch.float64 and not bool(scale.any())
+
+
+def test_a_scale_of_twice_the_size_is_twice_the_scale(tn34, tn06):
+    for part in (tn34, tn06):
+        size = part.part_object("L", 3)
+        torch.testing.assert_close(pose_scale(part, 2 * size), 2 * pose_scale(part, size))
+
+
+def test_scales_are_found_once_for_each_part_object(tn06, monkeypatch):
+    part = load_part("tn06")
+    asked = []
+    original = part.pose_space
+
+    def spy(parameters):
+        asked.append(tuple(parameters))
+        return original(parameters)
+
+    monkeypatch.setattr(part, "pose_space", spy)
+    sizes = [part.part_object("L", i) for i in (0, 5, 0, 5, 63, 0)]
+    found = [pose_scale(part, size) for size in sizes]
+    assert asked == [tuple(sizes[i]) for i in (0, 1, 4)]
+    assert torch.equal(found[0], found[2]) and torch.equal(found[0], found[5])
+    assert not torch.allclose(found[0], found[1])
+    torch.testing.assert_close(pose_scale(tn06, sizes[1]), found[1])  # another instance of the template
+
+
+def test_pose_labels_are_those_of_the_points_instance(part, make_scene):
+    scene = make_scene(part, bodies=5, points=60, seed=3)
+    labels = pose_labels(scene, part)
+    assert {name: (tuple(value.shape), value.dtype) for name, value in labels.items()} == {
+        "rotation": ((60, 3, 3), torch.float32),
+        "scale": ((3, 3), torch.float32),
+    }
+    for n, i in enumerate(scene.instance):
+        np.testing.assert_allclose(labels["rotation"][n].numpy(), scene.R[i], atol=1e-7)
+    torch.testing.assert_close(labels["scale"].double(), pose_scale(part, scene.parameters[0]))
+
+
+def test_pose_labels_turn_with_the_scene(part, make_scene):
+    scene = make_scene(part, seed=1)
+    before, after = (pose_labels(s, part) for s in (scene, rotate_about_view_axis(scene, 0.7)))
+    turn = torch.from_numpy(Rotation.from_euler("z", 0.7).as_matrix()).float()
+    torch.testing.assert_close(after["rotation"], turn @ before["rotation"], rtol=0, atol=1e-6)
+    assert torch.equal(after["scale"], before["scale"])
+
+
+def test_a_scene_without_bodies_has_pose_labels_too(tn34):
+    scene = two_flanges()
+    rows = {name: getattr(scene, name)[:0] for name in ("R", "t", "parameters", "visibility", "occlusion")}
+    empty = replace(scene, points=scene.points[:0], instance=scene.instance[:0], **rows)
+    labels = pose_labels(empty, tn34)
+    assert labels["rotation"].shape == (0, 3, 3)
+    expected = pose_scale(tn34, tn34.part_object("L", 0)).float()
+    assert torch.equal(labels["scale"], expected) and float(expected[0, 0]) > 0.003

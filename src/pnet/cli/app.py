@@ -23,6 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from pnet.cli.instantiate import trusted_modules
+from pnet.engine.locks import Busy
 
 Task = Callable[[DictConfig], None]
 LAUNCHERS = {"submitit": ("slurm", "hydra_submitit_launcher"), "ray": ("ray", "hydra_ray_launcher")}
@@ -111,7 +112,8 @@ def fail(fault: BaseException) -> NoReturn:
     if os.environ.get(TRACEBACK) == "1":
         raise fault
     text = error_text(fault)
-    print(f"error: {text}", file=sys.stderr)
+    if not isinstance(fault, Busy):  # the sweep says what it does about it
+        print(f"error: {text}", file=sys.stderr)
     raise CommandFailed(text) from fault
 
 

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf, open_dict
 
 from pnet.cli.app import hydra_value, key_of
 from pnet.cli.evaluate import Evaluation, wanted_evaluations
-from pnet.cli.settings import METRICS, RESOLVED, training_settings
+from pnet.cli.settings import DECIDE_NOTHING, METRICS, RESOLVED, training_settings
 from pnet.cli.sweep_file import CellPlan, TablePlan
 
 RUNS = Path("outputs/train")
@@ -69,7 +69,7 @@ class Composed:
     Attributes:
         settings: all that the training depends on. postprocess: the rest that results depend on.
         run: the folder. steps: of the training; 0 for a method without one.
-        evaluations: that the overrides themselves ask for.
+        evaluations, generate: what the overrides themselves ask for.
     """
 
     settings: dict[str, Any]
@@ -77,6 +77,7 @@ class Composed:
     run: Path
     steps: int
     evaluations: tuple[Evaluation, ...]
+    generate: tuple[str, ...]
 
 
 @lru_cache(maxsize=1024)
@@ -98,6 +99,7 @@ def composed(overrides: tuple[str, ...]) -> Composed:
         Path(plain["run_dir"]),
         int(steps),
         tuple(wanted_evaluations(plain["evaluate"])),
+        tuple(plain["data"]["generate"] or ()),
     )
 
 
@@ -120,11 +122,12 @@ def expand(arguments: Sequence[str]) -> list[list[str]]:
 
 
 def plain_jobs(arguments: Sequence[str]) -> list[Job]:
-    """A job for each combination of a multirun without a sweep file."""
-    index = RunIndex(RUNS)
+    """A job for each combination of a multirun without a sweep file, in a folder named by its overrides."""
     jobs: dict[Path, Job] = {}
     for words in expand(arguments):
-        job = make_job(tuple(words), index)
+        whole = composed(tuple(words))
+        asked = {evaluation.name: evaluation for evaluation in whole.evaluations}
+        job = Job(tuple(words), whole.run, whole.settings, whole.postprocess, whole.steps, None, asked)
         jobs.setdefault(job.run, job)
     return list(jobs.values())
 
@@ -136,7 +139,7 @@ def sweep_jobs(tables: Sequence[TablePlan], arguments: Sequence[str]) -> list[Jo
     for words in expand(arguments):
         for table in tables:
             for cell, overrides in restricted(table, words):
-                job = make_job(overrides, index, jobs, own_data(overrides, cell))
+                job = find_job(overrides, own_data(overrides, cell), jobs, index)
                 add_cell(job, cell, overrides)
     return jobs
 
@@ -152,49 +155,43 @@ def restricted(table: TablePlan, words: Sequence[str]) -> Iterator[tuple[CellPla
             yield cell, (*further, *cell.overrides)
 
 
-def make_job(
-    overrides: tuple[str, ...],
-    index: "RunIndex",
-    known: list[Job] | None = None,
-    generate: tuple[str, ...] | None = None,
+def find_job(
+    overrides: tuple[str, ...], generate: tuple[str, ...] | None, known: list[Job], index: "RunIndex"
 ) -> Job:
-    """The job of overrides: one that is known, or a new one, put to the known.
+    """The job of a cell's overrides: one that is known, or a new one, put to the known.
 
     A run that is there with the same settings is taken, whatever its name; else the folder is named by the
     overrides that change what is trained.
     """
     whole = composed(overrides)
-    for job in known or ():
+    for job in known:
         if job.settings == whole.settings:
             return job
     run = index.find(whole.settings)
-    named = tuple(overrides) if given_folder(overrides) else deciding(overrides, whole.settings)
+    named = deciding(overrides, whole.settings)
     if run is None:
         run = composed(named).run
     trained_with = index.postprocess.get(run, composed(named).postprocess)
     asked = {evaluation.name: evaluation for evaluation in whole.evaluations}
     job = Job(named, run, whole.settings, trained_with, whole.steps, generate, asked)
-    if known is not None:
-        known.append(job)
+    known.append(job)
     return job
 
 
 def own_data(overrides: Iterable[str], cell: CellPlan) -> tuple[str, ...] | None:
     """With which settings a cell's data is made; None where the user names a data set that is there."""
-    return None if any(key_of(word) == "data.root" for word in overrides) else cell.generate
-
-
-def given_folder(overrides: Iterable[str]) -> bool:
-    """Whether the user names the run's folder himself."""
-    return any(key_of(word) == "run_dir" for word in overrides)
+    if any(key_of(word) == "data.root" for word in overrides):
+        return None
+    return (*cell.generate, *composed(tuple(overrides)).generate)
 
 
 def deciding(overrides: Sequence[str], settings: dict[str, Any]) -> tuple[str, ...]:
-    """The overrides without those whose absence changes nothing of the training; part and protocol stay."""
+    """The overrides without those whose absence changes nothing of the training; part and protocol stay, and
+    what decides nothing by itself (threads, say)."""
     kept = list(overrides)
     for word in overrides:
         rest = [other for other in kept if other != word]
-        if key_of(word) in ("part", "protocol", "data.root"):
+        if key_of(word) in ("part", "protocol", "data.root", *DECIDE_NOTHING):
             continue
         if composed(tuple(rest)).settings == settings:
             kept = rest
@@ -257,9 +254,13 @@ class RunIndex:
         return next(iter(self.matching(settings, any_seed=False)), None)
 
     def matching(self, settings: dict[str, Any], any_seed: bool) -> list[Path]:
-        """The runs with these settings, whatever their seed or with this one."""
+        """The runs with these settings, whatever their seed or with this one; of equal ones the first."""
         free = {"seed": None} if any_seed else {}
-        return [run for run, own in self.settings.items() if {**own, **free} == {**settings, **free}]
+        found: dict[int, Path] = {}
+        for run, own in self.settings.items():
+            if {**own, **free} == {**settings, **free}:
+                found.setdefault(own["seed"], run)
+        return list(found.values())
 
 
 def read_metrics(run: Path) -> dict[str, Any] | None:

@@ -48,7 +48,8 @@ def run_one_by_one(
     Returns:
         one for each job, in order; a failed one's value is an exception with the reason.
     """
-    own = [word for word in hydra_overrides if not word.lstrip("+~").startswith(MULTIRUN_ONLY)]
+    own = config_flags(sys.argv[1:])
+    own += [word for word in hydra_overrides if not word.lstrip("+~").startswith(MULTIRUN_ONLY)]
     found: dict[int, Outcome] = {}
     for wait in (False, True):
         for number, overrides in enumerate(jobs):
@@ -61,6 +62,16 @@ def run_one_by_one(
             elif outcome.reason:
                 print(f"FAILED, the other jobs go on: {outcome.reason}", flush=True)
     return [job_return(found[number], overrides) for number, overrides in enumerate(jobs)]
+
+
+def config_flags(arguments: Sequence[str]) -> list[str]:
+    """The flags by which the user brings configs of his own; each job needs them too."""
+    found: list[str] = []
+    for i, word in enumerate(arguments):
+        name, _, value = word.partition("=")
+        if name in ("--config-dir", "-cd", "--config-name", "-cn"):
+            found += [name, value or arguments[i + 1]]
+    return found
 
 
 def run_in_process(command: str, overrides: Sequence[str], wait: bool = True) -> Outcome:
@@ -95,6 +106,7 @@ def job_return(outcome: Outcome, overrides: Sequence[str]) -> JobReturn:
 def _job(command: str, overrides: list[str], wait: bool, sender: "Connection") -> None:
     """A job's process: says how it ended. Its own output goes where the sweep's goes."""
     Thread(target=_end_with_parent, daemon=True).start()
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # what is nobody's mistake but ours keeps its name and traceback
     os.environ.pop(NO_WAIT, None)
     if not wait:
         os.environ[NO_WAIT] = "1"

@@ -122,7 +122,7 @@ def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
     summary = summarise(parts.network, torch.from_numpy(full.points[: cfg.data.points]))
     if not is_helper():
         print(summary)
-    add_settings(trainer.logger.experiment, OmegaConf.to_yaml(cfg))  # type: ignore[union-attr]
+        add_settings(run / "tensorboard", OmegaConf.to_yaml(cfg, resolve=True))
     try:
         trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     except SystemExit:  # what Lightning makes of Ctrl-C
@@ -182,10 +182,18 @@ def with_evaluations(metrics: dict[str, Any], evaluations: list[Evaluation], run
 
 def finish(cfg: DictConfig, run: Path, metrics: dict[str, Any]) -> None:
     """Tell TensorBoard what came out, then write metrics.json: with it the run is done."""
-    from pnet.engine.provenance import write_json
+    from pnet.engine.provenance import read_json, write_json
     from pnet.engine.tensorboard import log_hyperparameters
 
-    log_hyperparameters(run / "tensorboard", chosen_settings(cfg), final_scores(metrics))
+    paths = [run / "evaluation" / name / "curve.json" for name in metrics.get("evaluations", {})]
+    curves = {f"final/precision_recall_{p.parent.name}": read_json(p) for p in paths if p.is_file()}
+    log_hyperparameters(
+        run / "tensorboard",
+        chosen_settings(cfg),
+        ("part", "method", "keypoint_rule", "visibility_module", "learn"),  # what most sweeps vary
+        final_scores(metrics),
+        curves,
+    )
     write_json(run / METRICS, metrics)
 
 
@@ -349,30 +357,33 @@ def final_metrics(trainer: "lightning.Trainer", throughput: "Throughput") -> dic
 def chosen_settings(cfg: DictConfig) -> dict[str, Any]:
     """What TensorBoard's page of hyperparameters compares runs by."""
     return {
-        "part": identity_name(cfg.part._target_),
+        "part": cfg.part.get("name", identity_name(cfg.part._target_)),
         "protocol": cfg.protocol.name,
         "method": cfg.method.name,
+        "keypoint_rule": cfg.data.targets.rule,
+        "radius_filter": cfg.postprocess.get("radius_filter") is not None,
+        "visibility_module": cfg.model.visibility,
+        "learn": str(cfg.data.learn),
         "backbone": identity_name(cfg.backbone._target_),
         "loss": cfg.loss.get("norm", identity_name(cfg.loss._target_)),
         "optimizer": identity_name(cfg.optimizer._target_),
         "lr": cfg.optimizer.lr,
         "batch_size": cfg.data.batch_size,
         "steps": cfg.trainer.steps,
-        "keypoint_rule": cfg.data.targets.rule,
-        "visibility_module": cfg.model.visibility,
-        "learn": str(cfg.data.learn),
         "seed": cfg.seed,
     }
 
 
-def final_scores(metrics: dict[str, Any]) -> dict[str, float]:
-    """mAP on validation scenes and on each evaluation, by tag."""
-    plain = {"test_l": "final/mAP_L", "test_g": "final/mAP_G"}
-    scores = {f"final/{name}_val": metrics["validation"].get(name) for name in ("AP", "mAP", "loss")}
-    for name, values in metrics.get("evaluations", {}).items():
-        if name in plain:
-            scores[plain[name]] = values.get("mAP")
-    return {tag: value for tag, value in scores.items() if value is not None and value == value}
+def final_scores(metrics: dict[str, Any]) -> dict[str, float | None]:
+    """mAP on each evaluation and on validation scenes, by tag; None where it was not measured."""
+    evaluations, validation = metrics.get("evaluations", {}), metrics["validation"]
+    scores = {
+        "final/mAP_L": evaluations.get("test_l", {}).get("mAP"),
+        "final/mAP_G": evaluations.get("test_g", {}).get("mAP"),
+        "final/mAP_G_without_RF": evaluations.get("test_g_radius_filter-None", {}).get("mAP"),
+        **{f"final/{name}_val": validation.get(name) for name in ("mAP", "AP", "loss")},
+    }
+    return {tag: value if value == value else None for tag, value in scores.items()}
 
 
 def identity_name(target: str) -> str:

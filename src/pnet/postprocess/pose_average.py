@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -66,8 +67,7 @@ class PoseAveraging:
                 raise ValueError("postprocess.refine needs the scene's points")
             R, t = self.refine(part, parameters, R, t, points.cpu().double(), labels)
         score = instance_score(visibility, labels, d)
-        keypoints = apply_pose(R, t, part.chain.keypoints_from_parameters(parameters))
-        found = Detections(R, t, parameters, score, keypoints, labels)
+        found = Detections(R, t, parameters, score, _keypoints(part, parameters, R, t), labels)
         return best_first(found, sure_enough(score, visibility, self.visibility_threshold))
 
     def _segment(self, centroids: Tensor, visibility: Tensor | None) -> Tensor:
@@ -81,7 +81,14 @@ class PoseAveraging:
 
 
 def known_parameters(part: ParametricPart, d: int) -> Tensor:
-    """(d, k) metres: the part's own where there is but one part object, else NaN."""
-    grid = torch.from_numpy(part.grids["L"])
-    row = grid[0] if len(grid) == 1 else torch.full_like(grid[0], math.nan)
+    """(d, k) metres: the part's own where there is but one part object, in all its grids, else NaN."""
+    grid = torch.from_numpy(np.concatenate(list(part.grids.values())))
+    row = grid[0] if bool((grid == grid[0]).all()) else torch.full_like(grid[0], math.nan)
     return row.expand(d, -1).clone()
+
+
+def _keypoints(part: ParametricPart, parameters: Tensor, R: Tensor, t: Tensor) -> Tensor:
+    """(d, m, 3) camera frame, metres; NaN without parameters: parts need not bear NaN."""
+    if bool(parameters.isnan().any()):
+        return torch.full((len(R), len(part.chain), 3), math.nan, dtype=torch.float64)
+    return apply_pose(R, t, part.chain.keypoints_from_parameters(parameters))
