@@ -14,6 +14,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from pnet.data.scene_folder import SceneFolder
 from pnet.engine.checkpoints import read_checkpoint
@@ -118,8 +119,12 @@ def test_tensorboard_holds_what_is_watched(smoke):
     assert any(name.startswith("lr") for name in scalars)
     assert "val/precision_recall" in tags["images"]
     assert any(name.startswith("val/points") for name in tags["tensors"])  # the mesh plugin's
-    assert any("settings" in name for name in tags["tensors"])
-    assert any("hparams" in name for book in books for name in book.summary_metadata)
+    assert {"settings/text_summary", "precision_recall/tn34"} <= tags["tensors"]
+    (book,) = books  # one folder: TensorBoard lists a run once
+    start = book.summary_metadata["_hparams_/session_start_info"].plugin_data.content
+    chosen = HParamsPluginData.FromString(start).session_start_info.hparams
+    assert chosen["part"].string_value == "TN34" and chosen["steps"].number_value == 4
+    assert chosen["visibility_module"].bool_value and chosen["learn"].string_value == "1"
 
 
 def test_evaluation_leaves_predictions_curve_and_metrics(smoke):

@@ -2,6 +2,7 @@
 
 from collections import Counter
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -96,3 +97,63 @@ def test_collate_stacks(folder, tn34):
     assert torch.equal(batch.centroid[1], dataset[4]["centroid"])
     assert batch.margin.shape == (2, 10, 3)
     assert torch.equal(batch.margin[0], dataset[1]["margin"])
+
+
+def parts_of_an_epoch(size: int, seed: int, draws: int, world: int, number: int) -> list[list[int]]:
+    return [epoch(EpochSampler(size, seed, draws, rank, world), number) for rank in range(world)]
+
+
+@given(
+    size=st.integers(1, 12),
+    seed=st.integers(0, 5),
+    draws=st.integers(1, 20),
+    world=st.integers(1, 5),
+    number=st.integers(0, 4),
+)
+def test_processes_together_see_what_one_would(size, seed, draws, world, number):
+    """Taken in turn they make the row of a single process whose epochs are `world` times as long."""
+    each = parts_of_an_epoch(size, seed, draws, world, number)
+    assert [len(part) for part in each] == [draws] * world
+    assert [len(EpochSampler(size, seed, draws, rank, world)) for rank in range(world)] == [draws] * world
+    together = [index for position in zip(*each, strict=True) for index in position]
+    assert together == epoch(EpochSampler(size, seed, world * draws), number)
+
+
+@given(size=st.integers(2, 12), seed=st.integers(0, 5), world=st.integers(2, 5))
+def test_no_scene_comes_to_two_processes_in_one_turn(size, seed, world):
+    """Epochs that end with a permutation: each scene once in each."""
+    each = [
+        epoch(EpochSampler(size * world, seed, size, rank, world), number)
+        for number in range(2)
+        for rank in range(world)
+    ]
+    for number in (0, 1):
+        seen = [index for part in each[number * world : (number + 1) * world] for index in part]
+        assert sorted(seen) == list(range(size * world))
+
+
+@given(size=st.integers(1, 12), seed=st.integers(0, 5), draws=st.none() | st.integers(1, 20))
+def test_one_process_alone_is_the_default(size, seed, draws):
+    for number in (0, 3):
+        assert epoch(EpochSampler(size, seed, draws, 0, 1), number) == epoch(
+            EpochSampler(size, seed, draws), number
+        )
+
+
+def test_without_draws_each_process_takes_as_many_as_there_are_scenes():
+    each = [epoch(EpochSampler(5, 0, None, rank, 3), 1) for rank in range(3)]
+    assert [len(part) for part in each] == [5, 5, 5]
+    assert Counter(index for part in each for index in part) == dict.fromkeys(range(5), 3)
+
+
+def test_the_draws_say_their_epoch_to_every_process():
+    sampler = EpochSampler(6, 0, 4, rank=1, world=2)
+    sampler.set_epoch(3)
+    assert [number for _, number in sampler] == [3] * 4
+
+
+def test_the_order_of_one_process_is_as_it_was():
+    """What trainings of before repeat: seed 3, epochs of five out of seven scenes."""
+    row = [int(i) for turn in range(3) for i in np.random.default_rng([3, turn]).permutation(7)]
+    sampler = EpochSampler(7, 3, 5)
+    assert [epoch(sampler, number) for number in range(4)] == [row[5 * n : 5 * n + 5] for n in range(4)]

@@ -1,13 +1,17 @@
 """A split's scenes by index; what is wrong with a folder is said with its name."""
 
+import json
 import pickle
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pnet.data.scene_folder import SceneFolder
-from pnet.scenes.store import CycleFile, write_cycle
+from pnet.records import SceneId
+from pnet.scenes.generation import MANIFEST
+from pnet.scenes.store import CycleFile, CycleHeader, write_cycle
 
 
 @pytest.fixture
@@ -90,3 +94,59 @@ def test_it_travels_to_a_worker(root):
     copy = pickle.loads(pickle.dumps(scenes))
     np.testing.assert_array_equal(copy[4].points, first.points)
     assert copy.ids == scenes.ids
+
+
+@pytest.fixture
+def objects(tmp_path, tn34, make_scene):
+    """Two cycles of part objects 0, 3, 4 and 9, two scenes each."""
+    (tmp_path / "train").mkdir()
+    for cycle in (0, 1):
+        for place in (0, 3, 4, 9):
+            made = [
+                replace(make_scene(tn34, drop, 64 + place), id=SceneId("train", "pile", cycle, place, drop))
+                for drop in (1, 2)
+            ]
+            header = CycleHeader("tiny", "tn34", made[0].camera, "train", "pile", cycle, place, (1, 2))
+            write_cycle(tmp_path / "train" / f"{made[0].id.file_stem}.safetensors", header, made)
+    return tmp_path
+
+
+def test_only_scenes_of_the_objects_to_keep_are_there(objects):
+    asked = []
+
+    def keep(places):
+        asked.append(places)
+        return {9, 3, 77}
+
+    scenes = SceneFolder(objects, "train", "tn34", keep=keep)
+    assert asked == [{0, 3, 4, 9}]
+    places = [(cycle, place, drop) for cycle in (0, 1) for place in (3, 9) for drop in (1, 2)]
+    assert [(i.cycle, i.part_index, i.drop) for i in scenes.ids] == places
+    assert [scene.id for scene in scenes] == scenes.ids and len(scenes) == 8
+    assert [len(scene.points) for scene in scenes] == 2 * [67, 67, 73, 73]
+    assert scenes.points_per_scene == 67
+    assert SceneFolder(objects, "train", "tn34").points_per_scene == 64
+
+
+def test_all_objects_kept_are_all_scenes(objects):
+    every, kept = (SceneFolder(objects, "train", "tn34", 2, keep) for keep in (None, lambda places: places))
+    assert kept.ids == every.ids and len(every) == 8
+
+
+def test_kept_scenes_travel_to_a_worker(objects):
+    scenes = SceneFolder(objects, "train", "tn34", keep=lambda places: {4})
+    copy = pickle.loads(pickle.dumps(scenes))
+    assert copy.ids == scenes.ids and copy[3].id == scenes.ids[3] and copy[3].id.part_index == 4
+
+
+def test_a_cycle_that_is_missing_is_missed_also_where_its_object_is_not_kept(objects):
+    (objects / MANIFEST).write_text(json.dumps({"files": {"train": 8}}))
+    assert len(SceneFolder(objects, "train", "tn34", keep=lambda places: {0})) == 4
+    (objects / "train" / "pile_0001_part_09.safetensors").unlink()
+    with pytest.raises(ValueError, match="only 7 of 8 cycles are there"):
+        SceneFolder(objects, "train", "tn34", keep=lambda places: {0})
+
+
+def test_nothing_kept_is_an_error(objects):
+    with pytest.raises(ValueError, match=r"train: its files hold no scene"):
+        SceneFolder(objects, "train", "tn34", keep=lambda places: set())

@@ -29,7 +29,12 @@ from pnet.engine.tensorboard import (
     curve_arrays,
     log_hyperparameters,
 )
-from pnet.metrics.average_precision import PrecisionRecallCurve, average_precision, precision_recall_curve
+from pnet.metrics.average_precision import (
+    PrecisionRecallCurve,
+    average_precision,
+    count_positives,
+    precision_recall_curve,
+)
 from pnet.metrics.matching import SceneMatch
 from pnet.records import Detections, Scene
 
@@ -187,6 +192,14 @@ def test_curve_arrays_of_a_case_by_hand():
     assert tn.tolist() == [0, 0, 0, 0]
     assert precision == pytest.approx([2 / 3, 1 / 2, 1, 1])
     assert recall == pytest.approx([2 / 3, 1 / 3, 1 / 3, 0])
+
+
+def test_counts_are_sums_over_scenes_and_precision_and_recall_are_means():
+    """One of two bodies found beside a false result; a bin without bodies where one is found."""
+    scenes = [match([0.9, 0.5], [1, 0], [1, 0], [1, 1]), match([0.7], [-1], [0], [])]
+    arrays = curve_arrays(scenes)
+    assert arrays[:, 0] == pytest.approx([1, 2, 0, 1, (1 / 2 + 0) / 2, (1 / 2 + 1) / 2])
+    assert tuple(arrays[:2, 0]) == count_positives(scenes)
 
 
 def test_a_short_curve_is_there_with_every_point(tn34, make_scene):

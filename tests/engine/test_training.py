@@ -180,13 +180,24 @@ def test_throughput_counts_scenes_and_leaves_validation_out(monkeypatch):
     logged = []
     module = SimpleNamespace(log=lambda name, value, **_: logged.append(value))
     batch = SimpleNamespace(points=torch.zeros(6, 1, 3))
-    throughput = Throughput()
-    throughput.on_train_batch_start(None, module)
-    throughput.on_train_batch_end(None, module, None, batch, 0)
-    throughput.on_train_batch_start(None, module)
-    throughput.on_train_batch_end(None, module, None, batch, 1)
-    throughput.on_validation_start(None, module)
-    throughput.on_train_batch_start(None, module)  # at 100: the pause does not count
-    throughput.on_train_batch_end(None, module, None, batch, 2)
+    throughput, trainer = Throughput(), SimpleNamespace(world_size=1)
+    throughput.on_train_batch_start(trainer, module)
+    throughput.on_train_batch_end(trainer, module, None, batch, 0)
+    throughput.on_train_batch_start(trainer, module)
+    throughput.on_train_batch_end(trainer, module, None, batch, 1)
+    throughput.on_validation_start(trainer, module)
+    throughput.on_train_batch_start(trainer, module)  # at 100: the pause does not count
+    throughput.on_train_batch_end(trainer, module, None, batch, 2)
     assert throughput.scenes == 18 and throughput.seconds == pytest.approx(3.5)
+
+
+def test_throughput_goes_on_from_a_checkpoint_and_counts_every_process(monkeypatch):
+    times = iter([0.0, 2.0])
+    monkeypatch.setattr("pnet.engine.callbacks.perf_counter", lambda: next(times))
+    module, trainer = SimpleNamespace(log=lambda *_, **__: None), SimpleNamespace(world_size=3)
+    throughput = Throughput()
+    throughput.load_state_dict({"scenes": 10, "seconds": 4.0})
+    throughput.on_train_batch_start(trainer, module)
+    throughput.on_train_batch_end(trainer, module, None, SimpleNamespace(points=torch.zeros(2, 1, 3)), 0)
+    assert throughput.state_dict() == {"scenes": 16, "seconds": 6.0}
     assert logged == pytest.approx([6, 4, 6])

@@ -104,3 +104,24 @@ def test_parameters_on_one_side_only_are_refused():
 def test_no_scene_is_an_error():
     with pytest.warns(UserWarning, match="compute"), pytest.raises(ValueError, match="no scene"):
         PoseMetrics().compute()
+
+
+def test_unknown_parameters_have_no_error_and_change_nothing_else():
+    """As PPR-Net's results have them; the table shows a dash."""
+    known, unknown = PoseMetrics(), PoseMetrics()
+    truth_parameters, found = torch.full((3, 2), 0.010), torch.full((4, 2), 0.011)
+    known.update(SPACE, truth(), results(), truth_parameters, found)
+    unknown.update(SPACE, truth(), results(), truth_parameters, torch.full_like(found, math.nan))
+    expected, scores = known.compute(), unknown.compute()
+    assert expected.pop("parameter_error_mm") == pytest.approx(1.0, rel=1e-5)
+    assert math.isnan(scores.pop("parameter_error_mm"))
+    assert scores == expected and scores["AP"] == 0.5
+
+
+def test_unknown_parameters_in_one_scene_leave_no_error():
+    """A mean over some of the bodies would pass for one over all."""
+    metric = PoseMetrics()
+    for value in (0.011, math.nan):
+        metric.update(SPACE, truth(), results(), torch.full((3, 1), 0.010), torch.full((4, 1), value))
+    assert math.isnan(metric.compute()["parameter_error_mm"])
+    assert metric.compute()["position_error_mm"] == pytest.approx(1.0, rel=1e-5)

@@ -108,7 +108,7 @@ def test_the_distance_of_the_benchmark_is_nothing_then(part, make_scene):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_third_of_wild_votes_turns_a_pose_by_little(part, make_scene, seed):
-    """Votes with 3° of noise, three in ten of them anything: a plain mean is 20 times further off."""
+    """Votes with 3° of noise, three in ten of them anything."""
     scene = make_scene(part, bodies=6, points=1200, seed=seed)
     found = recover(part, predict(part, scene, noise=math.radians(3), wild=0.3, seed=seed))
     assert len(found.score) == 6
@@ -123,7 +123,7 @@ def test_float32_predictions_make_float64_detections(part, make_scene):
     assert {v.dtype for v in (found.R, found.t, found.score, found.parameters)} == {torch.float64}
     assert float(angles(part, scene, found).max()) < 1e-5
     eye = torch.eye(3, dtype=torch.float64).expand(3, 3, 3)
-    torch.testing.assert_close(found.R @ found.R.mT, eye, rtol=0, atol=1e-9)
+    torch.testing.assert_close(found.R @ found.R.mT, eye, rtol=0, atol=1e-6)
     assert float(torch.linalg.det(found.R).min()) > 0
 
 

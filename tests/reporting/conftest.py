@@ -127,3 +127,14 @@ def empty_scene(scene: Scene) -> Scene:
 def nothing(detect: Callable[[list[int]], Detections]) -> Detections:
     """No detections in a scene without points."""
     return replace(detect([]), instance=torch.zeros(0, dtype=torch.int64))
+
+
+@pytest.fixture
+def sizeless() -> Callable[[Detections], Detections]:
+    """The same detections by a method that knows of no sizes (PPR-Net)."""
+
+    def make(found: Detections) -> Detections:
+        unknown = torch.full_like(found.parameters, torch.nan)
+        return replace(found, parameters=unknown, keypoints=torch.full_like(found.keypoints, torch.nan))
+
+    return make

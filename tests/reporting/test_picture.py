@@ -16,7 +16,7 @@ from pnet.reporting.picture import (
     scene_picture,
     unexplained,
 )
-from pnet.reporting.scene_view import detected_bodies, instance_colours
+from pnet.reporting.scene_view import AXIS_COLOURS, detected_bodies, instance_colours
 
 
 def nearest_hue(pixel, colours):
@@ -133,3 +133,38 @@ def test_the_caption_counts(scene, detect):
     assert headings == ("Points, coloured by instance (600)", "Estimated poses (2)")
     assert "3 bodies in the bin, 2 poses estimated" in foot
     assert "1 without a valid solid" in foot
+
+
+def test_bodies_of_unknown_size_are_drawn_as_axes(scene, detect, sizeless, flange, tmp_path, view):
+    """On the ends of x, to the right, and y, upwards, lie the axes' colours; no body covers them."""
+    scene_picture(scene, sizeless(detect([0, 2])), flange, tmp_path / "scene.png")
+    with Image.open(tmp_path / "scene.png") as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
+    left, top = SIZE[0] - PANEL - 8, 64
+    for body, drawn in ((0, True), (1, False), (2, True)):
+        for offset, colour in (([0.014, 0, 0], AXIS_COLOURS[0]), ([0, -0.014, 0], AXIS_COLOURS[1])):
+            ((u, v),) = view.project(scene.t[[body]] + offset).round().astype(int)
+            patch = pixels[v + top - 3 : v + top + 4, u + left - 3 : u + left + 4].reshape(-1, 3)
+            wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+            assert (np.abs(patch - wanted).max(1) < 12).any() == drawn, (body, colour)
+
+
+def test_axes_behind_the_camera_are_left_out(scene, detect, sizeless, flange, tmp_path):
+    found = sizeless(detect([0, 1, 2]))
+    t = found.t.clone()
+    t[0, 2], t[1, 2] = -0.5, 0.01
+    scene_picture(scene, replace(found, t=t), flange, tmp_path / "scene.png")
+    with Image.open(tmp_path / "scene.png") as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
+    wanted = [int(AXIS_COLOURS[0][i : i + 2], 16) for i in (1, 3, 5)]
+    where = np.argwhere(np.abs(pixels - wanted).max(2) < 12)
+    assert len(where) > 20 and np.ptp(where[:, 0]) < 12  # one line along x
+
+
+def test_the_caption_tells_axes_from_what_is_not_drawn(scene, detect):
+    both = caption_texts(scene, detect([0, 1, 2]), 3, 2)[1]
+    assert (
+        "sizes are not estimated: axes stand for the bodies   ·   1 without a valid solid, not drawn" in both
+    )
+    alone = caption_texts(scene, detect([0, 1]), 2, 2)[1]
+    assert "axes stand for the bodies" in alone and "not drawn" not in alone

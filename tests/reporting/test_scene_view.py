@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from pnet.reporting.page import PageContent, page_html
 from pnet.reporting.scene_view import (
+    AXIS_COLOURS,
     GREY,
+    estimated_axes,
     instance_colours,
     point_colours,
     pose_bodies,
@@ -149,3 +152,88 @@ def test_colours_are_far_apart_and_stay_when_more_are_needed():
 def test_points_of_no_instance_are_grey():
     colours = point_colours(np.array([1, -1]), 2)
     np.testing.assert_array_equal(colours, [instance_colours(2)[1], GREY])
+
+
+def test_axes_of_a_body_of_unknown_size_by_hand(scene, detect, sizeless, flange):
+    """Tops towards the camera: y and z turned round. As long as the radius, 18 mm, the larger parameter."""
+    axes = estimated_axes(flange, sizeless(detect([2])))
+    origin = np.array([0.06, 0, 0.6])
+    ends = origin + 0.018 * np.diag([1, -1, -1])
+    np.testing.assert_allclose(axes, [[[origin, end] for end in ends]], atol=1e-12)
+
+
+def test_axes_are_the_columns_of_the_rotation(scene, detect, sizeless, flange):
+    R = torch.tensor([[0.0, -0.6, 0.8], [1, 0, 0], [0, 0.8, 0.6]]).double()
+    axes = estimated_axes(flange, replace(sizeless(detect([1])), R=R[None]))[0]
+    np.testing.assert_allclose((axes[:, 1] - axes[:, 0]) / 0.018, R.T, atol=1e-9)
+
+
+def test_bodies_of_known_size_and_lost_ones_have_no_axes(scene, detect, sizeless, flange):
+    known, unknown = detect([0, 1, 2]), sizeless(detect([0, 1, 2]))
+    assert estimated_axes(flange, known).shape == (0, 3, 2, 3)
+    assert estimated_axes(flange, sizeless(detect([]))).shape == (0, 3, 2, 3)
+    t = unknown.t.clone()
+    t[1, 2] = torch.nan
+    axes = estimated_axes(flange, replace(unknown, t=t))
+    np.testing.assert_allclose(axes[:, 0, 0], scene.t[[0, 2]])
+    mixed = replace(
+        unknown, parameters=torch.where(torch.tensor([[True], [False], [True]]), known.parameters, torch.nan)
+    )
+    np.testing.assert_allclose(estimated_axes(flange, mixed)[:, 0, 0], scene.t[[1]])
+
+
+def test_without_sizes_the_estimates_are_drawn_as_axes(scene, detect, sizeless, flange):
+    figure = scene_figure(scene, sizeless(detect([2, 0])), flange)
+    layers = traces(figure)
+    assert "estimates" not in layers and len(layers["truth"].x) == 3 * VERTICES
+    drawn = layers["axes of estimates"]
+    assert drawn.legendgroup == "estimates" and drawn.showlegend
+    lines = np.stack([drawn.x, drawn.y, drawn.z], -1).reshape(2, 3, 3, 3)
+    assert np.isnan(lines[:, :, 2]).all()  # the gap between two lines
+    np.testing.assert_allclose(
+        lines[:, :, 0], np.tile([[[60, 0, 600]], [[-60, 0, 600]]], (1, 3, 1)), atol=0.01
+    )
+    np.testing.assert_allclose(lines[0, :, 1], [[78, 0, 600], [60, -18, 600], [60, 0, 582]], atol=0.01)
+    assert list(drawn.line.color) == 2 * [c for c in AXIS_COLOURS for _ in range(3)]
+    assert notes(figure) == ["sizes are not estimated: axes stand for the bodies"]
+    ranges = [figure.layout.scene[f"{name}axis"].range for name in "xyz"]
+    assert all(np.isfinite(ends).all() for ends in ranges)
+
+
+def test_with_sizes_there_are_none(scene, detect, flange):
+    layers = traces(scene_figure(scene, detect([2, 0]), flange))
+    assert len(layers["axes of estimates"].x) == 0 and not layers["axes of estimates"].showlegend
+
+
+def test_solids_axes_and_lost_bodies_are_told_apart(scene, detect, sizeless, flange):
+    found = detect([0, 1, 2])
+    parameters, t = found.parameters.clone(), found.t.clone()
+    parameters[1] = torch.nan
+    t[2] = torch.inf
+    figure = scene_figure(scene, replace(found, parameters=parameters, t=t), flange)
+    assert len(traces(figure)["estimates"].x) == VERTICES
+    assert len(traces(figure)["axes of estimates"].x) == 9
+    assert notes(figure) == [
+        "sizes are not estimated: axes stand for the bodies",
+        "estimates without a valid solid, not drawn: 1",
+    ]
+
+
+def test_hover_says_nothing_of_unknown_sizes(scene, detect, sizeless, flange):
+    points = traces(scene_figure(scene, sizeless(detect([2, 0])), flange))["points"]
+    assert points.hovertemplate == (
+        "<b>detection %{customdata[0]}</b><br>score %{customdata[1]:.3f}"
+        "<br>at (%{customdata[2]:.1f}, %{customdata[3]:.1f}, %{customdata[4]:.1f}) mm<extra></extra>"
+    )
+    np.testing.assert_allclose(
+        np.unique(points.customdata[:, :5], axis=0), [[1, 0.9, 60, 0, 600], [2, 0.8, -60, 0, 600]], atol=1e-4
+    )
+
+
+def test_the_page_of_a_method_without_sizes_is_whole(scene, detect, sizeless, flange):
+    figure = scene_figure(scene, sizeless(detect([2, 0])), flange)
+    row = ("Parameter error", "–", "Mean error of the estimated dimensions of found bodies.")
+    page = page_html(PageContent("pnet", "one", [row], [("a scene", figure)], figure, None, "", []))
+    assert "<strong>–</strong>" in page and "axes of estimates" in page
+    assert page.rstrip().endswith("</html>")
+    assert "NaN" not in page.split("const config", 1)[1]

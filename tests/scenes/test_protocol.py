@@ -5,8 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
+from tests.conftest import load_part
 
 from pnet.cli.instantiate import instantiate
+from pnet.parts.spread import spread_order
 from pnet.records import SceneId
 from pnet.scenes.protocol import CycleTask, Protocol, SplitPlan
 
@@ -110,7 +112,7 @@ def test_another_seed_or_part_draws_other_numbers():
 
 def test_splits_draw_different_numbers():
     """Splits share no cycle of a grid, so no scene of one is a scene of another."""
-    for name in ("paper", "demo", "smoke"):
+    for name in ("paper", "small", "demo", "smoke"):
         tasks = config(name).tasks({"L": range(12), "G": range(12)})
         numbers = {t.rng(0, "tn34").random() for t in tasks}
         assert len(numbers) == len(tasks)
@@ -145,6 +147,11 @@ def test_clutter_outside_training_is_refused():
             r"split train: clutter is 1.0, expected a share in \[0, 1\)",
         ),
         ({"train": SplitPlan("L", 1, clutter=-0.1)}, "split train: clutter is -0.1"),
+        ({"train": SplitPlan("L", 1, count=0)}, "split train: count is 0, expected at least 1"),
+        (
+            {"val": SplitPlan("L", 1, count=2, objects=[0])},
+            "split val: count is 2, expected at least 1, and no objects beside it",
+        ),
     ],
 )
 def test_a_split_that_makes_no_sense_is_named(splits, message):
@@ -168,3 +175,82 @@ def test_a_part_without_a_generalization_grid_has_no_split_of_it():
     plan = protocol(train=SplitPlan("L", cycles=1), test_g=SplitPlan("G", cycles=1))
     assert {task.split for task in plan.tasks({"L": range(2)})} == {"train"}
     assert {task.split for task in plan.tasks({"L": range(2), "G": range(2)})} == {"train", "test_g"}
+
+
+def objects_of(plan: Protocol, split: str, orders) -> list[int]:
+    return sorted({task.part_index for task in plan.tasks(orders) if task.split == split})
+
+
+ORDER = [3, 0, 6, 5, 1, 4, 2, 7]
+
+
+@pytest.mark.parametrize(
+    ("count", "objects"),
+    [(1, [3]), (3, [0, 3, 6]), (8, list(range(8))), (9, list(range(8))), (500, list(range(8)))],
+)
+def test_a_count_takes_so_many_objects_from_the_beginning_of_the_order(count, objects):
+    plan = protocol(train=SplitPlan("L", cycles=2, count=count, clutter=0.5))
+    tasks = plan.tasks({"L": ORDER})
+    assert len(tasks) == 4 * len(objects)
+    for kind in ("pile", "clutter"):
+        places = [(t.cycle, t.part_index) for t in tasks if t.kind == kind]
+        assert places == [(cycle, index) for cycle in (0, 1) for index in objects]
+
+
+def test_a_smaller_count_takes_some_of_a_larger_ones():
+    plan = protocol(
+        train=SplitPlan("L", 1, count=5), val=SplitPlan("L", 1, 1, count=2), test_l=SplitPlan("L", 1, 2)
+    )
+    assert objects_of(plan, "val", {"L": ORDER}) == [0, 3]
+    assert objects_of(plan, "train", {"L": ORDER}) == [0, 1, 3, 5, 6]
+    assert objects_of(plan, "test_l", {"L": ORDER}) == list(range(8))
+
+
+def test_places_are_those_of_the_grid_whatever_the_order():
+    plan = protocol(train=SplitPlan("L", 1, objects=[0, 0.7]), val=SplitPlan("L", 1, 1))
+    assert objects_of(plan, "train", {"L": ORDER}) == [0, 5]
+    assert objects_of(plan, "val", {"L": ORDER}) == list(range(8))
+
+
+@pytest.mark.parametrize("name", ["tn06", "tn16", "tn34", "tn42"])
+def test_small_learns_eight_objects_in_four_cycles_and_tests_on_them(name):
+    part, plan = load_part(name), config("small")
+    orders = {which: spread_order(grid) for which, grid in part.grids.items()}
+    trained = objects_of(plan, "train", orders)
+    assert len(trained) == 8 and objects_of(plan, "test_l", orders) == trained
+    for column in part.grids["L"][trained].T:
+        assert np.unique(column, return_counts=True)[1].tolist() == [2, 2, 2, 2]
+    assert len(objects_of(plan, "val", orders)) == 4 and set(objects_of(plan, "val", orders)) <= set(trained)
+    for column in part.grids["L"][objects_of(plan, "val", orders)].T:
+        assert len(np.unique(column)) == 4
+    assert objects_of(plan, "test_g", orders) == trained  # the same places of the other grid
+    tasks = plan.tasks(orders)
+    numbers = {(split, kind): 0 for split in plan.splits for kind in ("pile", "clutter")}
+    for task in tasks:
+        numbers[task.split, task.kind] += 1
+    assert numbers == {
+        ("train", "pile"): 32,
+        ("train", "clutter"): 32,
+        ("val", "pile"): 4,
+        ("val", "clutter"): 0,
+        ("test_l", "pile"): 8,
+        ("test_l", "clutter"): 0,
+        ("test_g", "pile"): 8,
+        ("test_g", "clutter"): 0,
+    }
+
+
+def test_smalls_splits_share_no_cycle_of_a_part_object():
+    part, plan = load_part("tn34"), config("small")
+    tasks = plan.tasks({which: spread_order(grid) for which, grid in part.grids.items()})
+    made = [(task.grid, task.kind, task.cycle, task.part_index) for task in tasks]
+    assert len(set(made)) == len(made) == 84
+    assert {task.grid for task in tasks if task.split == "test_g"} == {"G"}
+    assert {task.grid for task in tasks if task.split != "test_g"} == {"L"}
+    assert plan.scene_drops() == list(range(1, 31)) and plan.points == 4096
+
+
+def test_small_makes_do_with_fewer_objects():
+    tasks = config("small").tasks({"L": [0]})
+    assert {(task.split, task.part_index) for task in tasks} == {("train", 0), ("val", 0), ("test_l", 0)}
+    assert len(tasks) == 8 + 1 + 1

@@ -150,7 +150,7 @@ def _check_launcher(arguments: list[str]) -> None:
     """Say which extra a launcher of a cluster is in, where it is not installed; Hydra would list files."""
     # ours adds a GPU, a time limit and queueing again to the plugin's own settings of the same name
     warnings.filterwarnings(
-        "ignore", message=".*hydra/launcher/submitit_slurm' is validated", category=UserWarning
+        "ignore", message=r"\s*'hydra/launcher/submitit_slurm' is validated", category=UserWarning
     )
     for word in arguments:
         name = word.partition("hydra/launcher=")[2]

@@ -45,9 +45,9 @@ class Job:
     def missing(self) -> list[str]:
         """What is not there yet: "training", and names of evaluations; from the run's metrics.json."""
         metrics = read_metrics(self.run)
-        if metrics is None or int(metrics.get("steps") or 0) < self.steps:
+        if metrics is None or metrics["steps"] < self.steps:
             return ["training", *self.evaluations]
-        return [name for name in self.evaluations if name not in metrics.get("evaluations", {})]
+        return [name for name in self.evaluations if name not in metrics["evaluations"]]
 
     def command(self) -> list[str]:
         """Overrides with which pnet-train does all of it, or what is missing."""
@@ -112,7 +112,9 @@ def expand(arguments: Sequence[str]) -> list[list[str]]:
     choices: dict[str, list[str]] = {}
     for override in OverridesParser.create().parse_overrides(list(arguments)):
         key = override.get_key_element()
-        if not override.is_sweep_override():
+        if override.is_delete() and override.value() is None:  # with a value it would ask for that value
+            choices[key] = [key]
+        elif not override.is_sweep_override():
             choices[key] = [f"{key}={override.get_value_element_as_str()}"]
         elif override.is_discrete_sweep():
             choices[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
@@ -122,18 +124,29 @@ def expand(arguments: Sequence[str]) -> list[list[str]]:
 
 
 def plain_jobs(arguments: Sequence[str]) -> list[Job]:
-    """A job for each combination of a multirun without a sweep file, in a folder named by its overrides."""
+    """A job for each combination of a multirun without a sweep file, in a folder named by its overrides.
+
+    Raises:
+        ValueError: where different trainings would have the same folder.
+    """
     jobs: dict[Path, Job] = {}
     for words in expand(arguments):
         whole = composed(tuple(words))
         asked = {evaluation.name: evaluation for evaluation in whole.evaluations}
         job = Job(tuple(words), whole.run, whole.settings, whole.postprocess, whole.steps, None, asked)
-        jobs.setdefault(job.run, job)
+        first = jobs.setdefault(job.run, job)
+        if (first.settings, first.postprocess) != (job.settings, job.postprocess):
+            raise ValueError(f"{job.run}: the folder of several trainings; give each a run_dir of its own")
+        first.evaluations.update(asked)
     return list(jobs.values())
 
 
 def sweep_jobs(tables: Sequence[TablePlan], arguments: Sequence[str]) -> list[Job]:
-    """The jobs of a sweep: cells that train the same thing share one, whatever table they stand in."""
+    """The jobs of a sweep: cells that train the same thing share one, whatever table they stand in.
+
+    Raises:
+        ValueError: where no cell has the values that the arguments ask for.
+    """
     index = RunIndex(RUNS)
     jobs: list[Job] = []
     for words in expand(arguments):
@@ -141,6 +154,8 @@ def sweep_jobs(tables: Sequence[TablePlan], arguments: Sequence[str]) -> list[Jo
             for cell, overrides in restricted(table, words):
                 job = find_job(overrides, own_data(overrides, cell), jobs, index)
                 add_cell(job, cell, overrides)
+    if not jobs:
+        raise ValueError(f"no cell of the sweep has {' '.join(arguments)}")
     return jobs
 
 
@@ -210,22 +225,32 @@ def add_cell(job: Job, cell: CellPlan, overrides: Sequence[str]) -> str:
 def cell_evaluation(trained: dict[str, Any], cell: CellPlan, wanted: dict[str, Any]) -> Evaluation:
     """How a run with one post-processing is scored for a cell that wants another."""
     changes = changed(trained, wanted)
-    return Evaluation(cell.table.split, wanted if changes is None else changes)
+    if changes is None or "_target_" in changes:  # an evaluation's `_target_` stands in place of all settings
+        changes = wanted
+    return Evaluation(cell.table.split, changes)
 
 
 def changed(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any] | None:
-    """What has to be merged into old settings to make them new; None where merging cannot."""
-    if set(old) - set(new):
+    """What has to be merged into old settings to make them new; None where merging cannot.
+
+    Keys stay as they are, except below what was empty: an evaluation refuses others as misspelt.
+    """
+    if set(old) != set(new):
         return None
     changes: dict[str, Any] = {}
     for key, value in new.items():
-        if key in old and old[key] == value:
+        was = old[key]
+        if was == value:
             continue
-        if isinstance(value, dict) and isinstance(old.get(key), dict):
-            inner = changed(old[key], value)
+        if isinstance(value, dict) and isinstance(was, dict):
+            inner = changed(was, value)
             if inner is None:
                 return None
             changes[key] = inner
+        elif (isinstance(value, dict) and was is not None) or (
+            isinstance(value, list) and isinstance(was, dict)
+        ):
+            return None
         else:
             changes[key] = value
     return changes
@@ -254,19 +279,20 @@ class RunIndex:
         return next(iter(self.matching(settings, any_seed=False)), None)
 
     def matching(self, settings: dict[str, Any], any_seed: bool) -> list[Path]:
-        """The runs with these settings, whatever their seed or with this one; of equal ones the first."""
+        """The runs with these settings, whatever their seed or with this one; of equal ones the first that
+        has ended, else the first."""
         free = {"seed": None} if any_seed else {}
+        equal = [run for run, own in self.settings.items() if {**own, **free} == {**settings, **free}]
         found: dict[int, Path] = {}
-        for run, own in self.settings.items():
-            if {**own, **free} == {**settings, **free}:
-                found.setdefault(own["seed"], run)
+        for run in sorted(equal, key=lambda run: read_metrics(run) is None):
+            found.setdefault(self.settings[run]["seed"], run)
         return list(found.values())
 
 
 def read_metrics(run: Path) -> dict[str, Any] | None:
-    """A run's metrics.json; None where it is not there or damaged."""
+    """A run's metrics.json with its `steps` and `evaluations`; None where it is not there or damaged."""
     try:
         content = json.loads((run / METRICS).read_text())
-    except (OSError, ValueError):
+        return {**content, "steps": int(content["steps"]), "evaluations": {**content.get("evaluations", {})}}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
-    return content if isinstance(content, dict) else None

@@ -4,6 +4,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from statistics import median
 
+import yaml  # type: ignore[import-untyped]
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
 from rich.console import Console
@@ -28,7 +29,9 @@ def sweep(arguments: Sequence[str], launcher: Launcher) -> list[JobReturn]:
     jobs = planned_jobs(arguments)
     missing = [job for job in jobs if job.missing()]
     out = Console(soft_wrap=True)
-    dry = any(word in (f"{DRY_RUN}=true", f"{DRY_RUN}=True") for word in arguments)
+    dry = [yaml.safe_load(word.split("=", 1)[1]) for word in arguments if key_of(word) == DRY_RUN][-1:] == [
+        True
+    ]
     if dry:
         out.print(f"runs in {RUNS}:", *job_lines(jobs), sep="\n", markup=False, highlight=False)
     out.print(

@@ -55,7 +55,7 @@ class SceneFolder(Sequence[Scene]):
         chosen = [list(range(len(file)))[::-1][::every][::-1] for file in files]
         self._index = chosen
         self._ends = list(accumulate(len(indices) for indices in chosen))
-        if not self._ends[-1]:
+        if not any(chosen):
             raise ValueError(f"{root / split}: its files hold no scene; make the data anew")
         self._ids = [file.scene_id(i) for file, indices in zip(files, chosen, strict=True) for i in indices]
         # opened again where they are read: file handles do not travel to the loader's workers

@@ -9,12 +9,12 @@ from lightning.pytorch.loggers import TensorBoardLogger
 
 from pnet.engine.estimator import NetworkEstimator
 from pnet.engine.evaluation import SceneScorer
-from pnet.engine.tensorboard import add_curve, add_mesh
+from pnet.engine.tensorboard import add_curves, add_mesh
 from pnet.records import Detections, Scene
 
 
 class PoseValidation(lightning.Callback):
-    """AP and errors on validation scenes, a precision-recall curve, and a mesh of the fullest scene.
+    """AP and errors on validation scenes, precision-recall curves, and a mesh of the fullest scene.
 
     Args:
         estimator: shares the network that is trained. scenes: validation scenes.
@@ -40,18 +40,20 @@ class PoseValidation(lightning.Callback):
             return
         scorer = SceneScorer(self._estimator.part)
         fullest: tuple[Scene, Detections] | None = None
+        sizes = []
         for index in range(len(self._scenes)):
             scene = self._scenes[index]
             cloud = torch.from_numpy(scene.points[: self._points])
             found = self._estimator.estimate(cloud[None].to(pl_module.device))[0]
             scorer.add(scene, found)
+            sizes.append(scene.parameters[0] if len(scene.parameters) else None)
             if fullest is None or len(scene.R) > len(fullest[0].R):
                 fullest = scene, found
         values = {f"val/{name}": value for name, value in scorer.compute().items() if value == value}
         pl_module.log_dict(values, prog_bar=False)
-        if isinstance(trainer.logger, TensorBoardLogger):
+        if isinstance(trainer.logger, TensorBoardLogger) and trainer.is_global_zero:
             writer = trainer.logger.experiment
-            add_curve(writer, scorer, trainer.global_step)
+            add_curves(writer, self._estimator.part, scorer.metrics, sizes, trainer.global_step)
             if fullest and self._mesh_every and self._validations % self._mesh_every == 0:
                 add_mesh(writer, self._estimator.part, *fullest, trainer.global_step)
         self._validations += 1

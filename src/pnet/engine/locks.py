@@ -12,7 +12,8 @@ NO_WAIT = "PNET_NO_WAIT"  # environment: raise `Busy` instead of waiting
 
 
 def lock_path(folder: Path) -> Path:
-    """The lock's file: beside the folder, which may not be there yet."""
+    """The lock's file: beside the folder, which may not be there yet, whatever path leads to it."""
+    folder = folder.resolve()
     return folder.parent / f".{folder.name}.lock"
 
 

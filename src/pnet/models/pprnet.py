@@ -70,7 +70,9 @@ class RotationHead(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """features (B, N, F) → (B, N, 3, 3) rotations, part → camera."""
-        angles: Tensor = self.last(self.mlp(features)).float()
-        with torch.autocast(angles.device.type, enabled=False):  # a product in bf16 is no rotation
+        hidden: Tensor = self.mlp(features)
+        # in bf16 an angle is half a degree off, and a product of turns is no rotation
+        with torch.autocast(hidden.device.type, enabled=False):
+            angles = self.last(hidden.float())
             R: Tensor = roma.euler_to_rotmat("XYZ", angles)  # intrinsic: Rx Ry Rz
         return R

@@ -16,9 +16,11 @@ from pnet.geometry.camera import Camera
 from pnet.parts.base import ParametricPart
 from pnet.records import Detections, Scene
 from pnet.reporting.scene_view import (
+    AXIS_COLOURS,
     GREY,
     Bodies,
     detected_bodies,
+    estimated_axes,
     instance_colours,
     point_colours,
 )
@@ -55,7 +57,9 @@ def scene_picture(scene: Scene, detections: Detections, part: ParametricPart, pa
     image, depth = render_bodies(camera, found, instance_colours(len(detections.score)))
     draw_image(right, image)
     _draw_unexplained(right, camera, points, depth)
-    _caption(figure, *caption_texts(scene, detections, found.missing))
+    axes = estimated_axes(part, detections)
+    _draw_axes(right, camera, axes)
+    _caption(figure, *caption_texts(scene, detections, found.missing, len(axes)))
     write_png(figure, path)
 
 
@@ -190,6 +194,14 @@ def _draw_unexplained(axes: Axes, camera: Camera, points: Points, depth: Points)
     _scatter(axes, camera, alone, np.tile(GREY, (len(alone), 1)), 0.4 * _spacing(camera, points))
 
 
+def _draw_axes(panel: Axes, camera: Camera, axes: Points) -> None:
+    """Lines (a, 3, 2, 3) of the estimates that have no solid, the nearest last."""
+    before = axes[(axes[..., 2] > 0).all((1, 2))]
+    for lines in before[np.argsort(-before[:, 0, 0, 2])]:
+        for ends, colour in zip(lines, AXIS_COLOURS, strict=True):
+            panel.plot(*camera.project(ends).T, color=colour, linewidth=2.5, solid_capstyle="round")
+
+
 def _scatter(axes: Axes, camera: Camera, points: Points, colours: Points, diameter: float) -> None:
     """Discs of a diameter in pixels; the first point is painted first."""
     before = points[:, 2] > 0
@@ -257,11 +269,13 @@ def _caption(figure: Figure, headings: tuple[str, str], foot: str) -> None:
     figure.text(28 / SIZE[0], 26 / SIZE[1], foot, color=_QUIET, size=11.5, va="center")
 
 
-def caption_texts(scene: Scene, detections: Detections, missing: int) -> tuple[tuple[str, str], str]:
+def caption_texts(
+    scene: Scene, detections: Detections, missing: int, sizeless: int = 0
+) -> tuple[tuple[str, str], str]:
     """Headings of the two panels, and the line below them.
 
     Args:
-        missing: estimates without a valid solid.
+        missing: estimates without a valid solid. sizeless: those of them that are drawn as axes.
     """
     points, count = len(detections.instance), len(detections.score)
     cloud = f"Points, coloured by instance ({points:,})" if points else "This scene has no points"
@@ -269,8 +283,10 @@ def caption_texts(scene: Scene, detections: Detections, missing: int) -> tuple[t
     parts = [scene.part.upper(), str(scene.id)]
     if len(scene.R):
         parts.append(f"{len(scene.R)} bodies in the bin, {count} poses estimated")
-    if missing:
-        parts.append(f"{missing} without a valid solid, not drawn")
+    if sizeless:
+        parts.append("sizes are not estimated: axes stand for the bodies")
+    if missing > sizeless:
+        parts.append(f"{missing - sizeless} without a valid solid, not drawn")
     if points and count:
         parts.append("small grey: points beside or before the estimates")
     return (cloud, poses), "   ·   ".join(parts)

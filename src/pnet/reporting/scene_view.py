@@ -15,6 +15,7 @@ from pnet.records import Detections, Scene
 Points = NDArray[np.float64]
 
 GREY = (0.56, 0.59, 0.63)  # what belongs to no instance
+AXIS_COLOURS = ("#e5484d", "#46a758", "#4c8dff")  # x, y, z
 _SECTIONS = 24  # polygon sides of a circle: enough to recognise a part, and the page stays small
 _MOST_POINTS = 8192  # the first of the farthest-point order: an even sample
 _SHARP = np.radians(30)
@@ -76,6 +77,20 @@ def detected_bodies(part: ParametricPart, sections: int, detections: Detections)
     return pose_bodies(part, sections, R, t, parameters)
 
 
+def estimated_axes(part: ParametricPart, detections: Detections) -> Points:
+    """Axes of the estimates whose size the method does not know; what stands for a solid then.
+
+    Returns:
+        (a, 3, 2, 3) origin and end of x, y and z, as long as the part's largest parameter is on average;
+        camera frame, metres.
+    """
+    poses = (detections.R, detections.t, detections.parameters)
+    R, t, parameters = (tensor.detach().double().cpu().numpy() for tensor in poses)
+    shown = np.isnan(parameters).all(1) & np.isfinite(R).all((1, 2)) & np.isfinite(t).all(1)
+    origin = np.repeat(t[shown][:, None], 3, 1)
+    return np.stack([origin, origin + part.grids["L"].mean(0).max() * R[shown].swapaxes(1, 2)], 2)
+
+
 def instance_colours(count: int) -> Points:
     """(count, 3) in [0, 1]: told apart well, of like brightness; a larger count keeps the first ones."""
     i = np.arange(count)
@@ -107,18 +122,21 @@ def scene_figure(scene: Scene, detections: Detections, part: ParametricPart) -> 
     """
     sections = min(_SECTIONS, part.sections)
     found = detected_bodies(part, sections, detections)
+    axes = estimated_axes(part, detections)
     truth = pose_bodies(part, sections, scene.R, scene.t, scene.parameters)
     instance = detections.instance.cpu().numpy()
     points = _millimetres(scene.points[: len(instance)][:_MOST_POINTS])
     traces = [
         *_point_traces(points, instance[:_MOST_POINTS], detections, part),
         _estimate_trace(found, detections, part),
+        _axes_trace(axes),
         *_truth_traces(truth),
     ]
     # plotly.js stops at a mesh without corners, and makes a flat figure of no traces at all
     figure = go.Figure([trace for trace in traces if len(trace.x) or trace.type == "scatter3d"])
-    clouds = [points, _millimetres(found.mesh.vertices), _millimetres(truth.mesh.vertices)]
-    figure.update_layout(_layout(np.concatenate(clouds), _notes(len(points), detections, found)))
+    clouds = [points, *map(_millimetres, (found.mesh.vertices, axes, truth.mesh.vertices))]
+    notes = _notes(len(points), detections, found.missing, len(axes))
+    figure.update_layout(_layout(np.concatenate(clouds), notes))
     return figure
 
 
@@ -138,7 +156,7 @@ def _point_traces(
         showlegend=len(of) > 0,
         marker={"size": 2.2, "color": colours[of].tolist()},
         customdata=_hover_rows(detections)[of],
-        hovertemplate=_hover_template(part),
+        hovertemplate=_hover_template(part, detections),
     )
     others = go.Scatter3d(
         **_columns(points[instance < 0]),
@@ -168,7 +186,20 @@ def _estimate_trace(found: Bodies, detections: Detections, part: ParametricPart)
         opacity=0.7,
         lighting=_UNLIT,
         customdata=_hover_rows(detections)[owner],
-        hovertemplate=_hover_template(part),
+        hovertemplate=_hover_template(part, detections),
+    )
+
+
+def _axes_trace(axes: Points) -> go.Scatter3d:
+    """Lines (a, 3, 2, 3) of the estimates that have no solid; they belong to the same layer."""
+    return go.Scatter3d(
+        **_columns(_with_gaps(_millimetres(axes).reshape(-1, 2, 3))),
+        name="axes of estimates",
+        legendgroup="estimates",
+        showlegend=len(axes) > 0,
+        mode="lines",
+        line={"color": [c for c in AXIS_COLOURS for _ in range(3)] * len(axes), "width": 5},
+        hoverinfo="skip",
     )
 
 
@@ -199,7 +230,11 @@ def _truth_traces(truth: Bodies) -> list[go.Mesh3d | go.Scatter3d]:
 def _edge_lines(mesh: trimesh.Trimesh) -> NDArray[np.float32]:
     """(3e, 3) start and end of every sharp edge and a gap, mm."""
     sharp = mesh.face_adjacency_edges[mesh.face_adjacency_angles > _SHARP] if len(mesh.faces) else []
-    ends = _millimetres(mesh.vertices)[np.asarray(sharp, np.int64).reshape(-1, 2)]
+    return _with_gaps(_millimetres(mesh.vertices)[np.asarray(sharp, np.int64).reshape(-1, 2)])
+
+
+def _with_gaps(ends: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(n, 2, 3) starts and ends of lines → (3n, 3) with a gap after each."""
     return np.concatenate([ends, np.full_like(ends[:, :1], np.nan)], 1).reshape(-1, 3)
 
 
@@ -215,9 +250,11 @@ def _hover_rows(detections: Detections) -> NDArray[np.float32]:
     return np.concatenate(columns, 1).astype(np.float32)
 
 
-def _hover_template(part: ParametricPart) -> str:
+def _hover_template(part: ParametricPart, detections: Detections) -> str:
     values = "".join(
-        f"<br>{name} %{{customdata[{5 + i}]:.2f}} mm" for i, name in enumerate(part.parameter_names)
+        f"<br>{name} %{{customdata[{5 + i}]:.2f}} mm"
+        for i, name in enumerate(part.parameter_names)
+        if not bool(detections.parameters[:, i].isnan().all())
     )
     place = ", ".join(f"%{{customdata[{i}]:.1f}}" for i in (2, 3, 4))
     return (
@@ -280,14 +317,17 @@ def _layout(cloud: NDArray[np.float32], notes: Sequence[str]) -> go.Layout:
     )
 
 
-def _notes(points: int, detections: Detections, found: Bodies) -> list[str]:
+def _notes(points: int, detections: Detections, missing: int, sizeless: int) -> list[str]:
+    """missing: estimates without a solid; sizeless: those of them that are drawn as axes."""
     notes = []
     if not points:
         notes.append("this scene has no points")
     if not len(detections.score):
         notes.append("nothing was found")
-    if found.missing:
-        notes.append(f"estimates without a valid solid, not drawn: {found.missing}")
+    if sizeless:
+        notes.append("sizes are not estimated: axes stand for the bodies")
+    if missing > sizeless:
+        notes.append(f"estimates without a valid solid, not drawn: {missing - sizeless}")
     return notes
 
 
