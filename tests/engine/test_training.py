@@ -189,6 +189,7 @@ def test_throughput_counts_scenes_and_leaves_validation_out(monkeypatch):
     throughput.on_train_batch_start(trainer, module)  # at 100: the pause does not count
     throughput.on_train_batch_end(trainer, module, None, batch, 2)
     assert throughput.scenes == 18 and throughput.seconds == pytest.approx(3.5)
+    assert logged == pytest.approx([6, 4, 6])
 
 
 def test_throughput_goes_on_from_a_checkpoint_and_counts_every_process(monkeypatch):
@@ -200,4 +201,3 @@ def test_throughput_goes_on_from_a_checkpoint_and_counts_every_process(monkeypat
     throughput.on_train_batch_start(trainer, module)
     throughput.on_train_batch_end(trainer, module, None, SimpleNamespace(points=torch.zeros(2, 1, 3)), 0)
     assert throughput.state_dict() == {"scenes": 16, "seconds": 6.0}
-    assert logged == pytest.approx([6, 4, 6])

@@ -247,9 +247,9 @@ def changed(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any] | None:
             if inner is None:
                 return None
             changes[key] = inner
-        elif (isinstance(value, dict) and was is not None) or (
-            isinstance(value, list) and isinstance(was, dict)
-        ):
+        elif isinstance(value, dict) and was is not None:
+            return None
+        elif isinstance(value, list) and isinstance(was, dict):
             return None
         else:
             changes[key] = value

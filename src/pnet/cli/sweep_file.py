@@ -8,6 +8,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from pnet.cli.app import closest
+from pnet.cli.evaluate import SPLITS
 
 ORIGINS = ("both", "published", "ours")
 
@@ -93,11 +94,12 @@ def sweeps_dir() -> Path:
     raise FileNotFoundError(f"pnet's sweeps are missing beside {package}; install pnet again")
 
 
-def read_sweep(name: str) -> list[TablePlan]:
+def read_sweep(name: str, within: tuple[Path, ...] = ()) -> list[TablePlan]:
     """The tables of a sweep.
 
     Args:
         name: of a file in `sweeps/` without its ending, several with commas, or the path of another file.
+        within: the files that name it.
     Raises:
         FileNotFoundError, ValueError: names the file and the fault.
     """
@@ -106,8 +108,8 @@ def read_sweep(name: str) -> list[TablePlan]:
         path = _path(word.strip())
         content = _read(path)
         if "tables" in content:
-            for other in content["tables"]:
-                tables += read_sweep(str(other))
+            for other in _others(path, content, within):
+                tables += read_sweep(other, (*within, path))
         else:
             tables.append(_table(path, content))
     return list(dict.fromkeys(tables))
@@ -139,6 +141,20 @@ def _read(path: Path) -> dict[str, Any]:
     return {str(key): value for key, value in content.items()}
 
 
+def _others(path: Path, content: Mapping[str, Any], within: Sequence[Path]) -> list[str]:
+    """The names in `tables`."""
+    names = content["tables"]
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"{path}: tables must be a list of names of sweeps")
+    if len(content) > 1:
+        raise ValueError(
+            f"{path}: tables stands alone; {', '.join(set(content) - {'tables'})} cannot be there"
+        )
+    if path in within:
+        raise ValueError(f"{path}: its tables lead back to itself")
+    return names
+
+
 def _table(path: Path, content: Mapping[str, Any]) -> TablePlan:
     _check_keys(
         path, "", content, TablePlan, required=("number", "title", "metric", "split", "columns", "rows")
@@ -155,7 +171,10 @@ def _table(path: Path, content: Mapping[str, Any]) -> TablePlan:
                 f"{path}: row {row.name} has {len(row.published)} published figures for "
                 f"{len(lists['columns'])} columns"
             )
-    return TablePlan(**{"caption": "", **content, **lists})
+    if content["split"] not in SPLITS:
+        raise ValueError(f"{path}: split is {content['split']!r}, choose {', '.join(SPLITS)}")
+    texts = {key: str(value) for key, value in content.items() if value is not None}
+    return TablePlan(**{"caption": "", **texts, **lists})  # type: ignore[arg-type]
 
 
 def _heading(path: Path, where: str, entry: Any) -> Heading:
@@ -166,13 +185,17 @@ def _heading(path: Path, where: str, entry: Any) -> Heading:
         words = entry.get(key, [])
         if not isinstance(words, list) or not all(isinstance(w, str) and "=" in w for w in words):
             raise ValueError(f"{path}: {where}.{key} must be a list of overrides such as part=tn34")
-    published = tuple(entry.get("published") or ())
-    if not all(value is None or isinstance(value, (int, float)) for value in published):
+    published = entry.get("published") or ()
+    if not isinstance(published, (list, tuple)) or not all(_is_figure(value) for value in published):
         raise ValueError(f"{path}: {where}.published must hold numbers, or null where the paper has none")
     if entry.get("origin", "both") not in ORIGINS:
         raise ValueError(f"{path}: {where}.origin is {entry['origin']!r}, choose {', '.join(ORIGINS)}")
     tuples = {key: tuple(entry[key]) for key in ("set", "generate") if key in entry}
-    return Heading(**{**entry, **tuples, "published": published})
+    return Heading(**{**entry, **tuples, "published": tuple(published)})
+
+
+def _is_figure(value: Any) -> bool:
+    return value is None or (isinstance(value, (int, float)) and not isinstance(value, bool))
 
 
 def _check_keys(
