@@ -197,37 +197,41 @@ def test_a_list_of_sweeps_may_name_files_of_ones_own(write):
     assert [table.number for table in read_sweep(path)] == ["IX", "III"]
 
 
-def changed_small(place, key, value):
-    return {**SMALL, place: [{**SMALL[place][0], key: value}, *SMALL[place][1:]]}
+def row(key, value):
+    return {**SMALL, "rows": [{**SMALL["rows"][0], key: value}]}
+
+
+def column(key, value):
+    return {**SMALL, "columns": [{**SMALL["columns"][0], key: value}, SMALL["columns"][1]]}
 
 
 BAD = {
-    "an unknown key": ({**SMALL, "metrik": "AP"}, "metrik: unknown key, did you mean metric?"),
-    "an unknown key of a row": (changed_small("rows", "sets", []), "rows[0].sets: unknown key, did you mean set?"),
-    "an unknown key of a column": (changed_small("columns", "grup", "G"), "columns[0].grup: unknown key"),
+    "an unknown key": ({**SMALL, "metrik": "AP"}, "metrik: unknown key, did you mean metric"),
+    "an unknown key of a row": (row("sets", []), "rows[0].sets: unknown key, did you mean set?"),
+    "an unknown key of a column": (column("grup", "G"), "columns[0].grup: unknown key"),
     "no rows": ({**SMALL, "rows": []}, "rows must be a list with at least one entry"),
     "no list of columns": ({**SMALL, "columns": 3}, "columns must be a list with at least one entry"),
     "a row that is no table": ({**SMALL, "rows": ["full"]}, "rows[0] must have a name"),
     "a row without a name": ({**SMALL, "rows": [{"set": []}]}, "rows[0] lacks name"),
-    "too few figures": (changed_small("rows", "published", [0.5]), "row full has 1 published figures for 2 columns"),
-    "too many figures": (changed_small("rows", "published", [0.5] * 3), "row full has 3 published figures for 2"),
-    "a figure in words": (changed_small("rows", "published", ["high", None]), "rows[0].published must hold numbers"),
-    "one figure alone": (changed_small("rows", "published", 0.5), "rows[0].published must hold numbers"),
-    "a figure that is true": (changed_small("rows", "published", [True, None]), "rows[0].published must hold"),
-    "an unknown origin": (changed_small("rows", "origin", "theirs"), "rows[0].origin is 'theirs', choose both"),
-    "no list of overrides": (changed_small("rows", "set", "part=tn34"), "rows[0].set must be a list of overrides"),
-    "an override without value": (changed_small("rows", "set", ["tn34"]), "rows[0].set must be a list of overrides"),
-    "a bad generate": (changed_small("columns", "generate", [3]), "columns[0].generate must be a list of overrides"),
+    "too few figures": (row("published", [0.5]), "row full has 1 published figures for 2 columns"),
+    "too many figures": (row("published", [0.5] * 3), "row full has 3 published figures for 2"),
+    "a figure in words": (row("published", ["high", None]), "rows[0].published must hold numbers"),
+    "one figure alone": (row("published", 0.5), "rows[0].published must hold numbers"),
+    "a figure that is true": (row("published", [True, None]), "rows[0].published must hold"),
+    "an unknown origin": (row("origin", "theirs"), "rows[0].origin is 'theirs', choose both"),
+    "no list of overrides": (row("set", "part=tn34"), "rows[0].set must be a list of overrides"),
+    "an override without value": (row("set", ["tn34"]), "rows[0].set must be a list of overrides"),
+    "a bad generate": (column("generate", [3]), "columns[0].generate must be a list of overrides"),
     "an unknown split": ({**SMALL, "split": "test"}, "split is 'test', choose val, test_l, test_g"),
     "a list": ([SMALL], "expected a table: number, title"),
-    "nothing": ("", "expected a table: number, title"),
+    "nothing": ("", "the table lacks number"),
     "no YAML": ("number: [1", "not readable"),
     "not even text": ("\x00", "not readable"),
     "tables that are no list": ({"tables": "table3"}, "tables must be a list of names of sweeps"),
     "tables that are none": ({"tables": None}, "tables must be a list of names of sweeps"),
     "tables that are no names": ({"tables": [SMALL]}, "tables must be a list of names of sweeps"),
     "tables beside a table": ({**SMALL, "tables": ["table3"]}, "tables stands alone"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", BAD)

@@ -92,6 +92,11 @@ def test_only_the_values_order_counts():
     np.testing.assert_array_equal(objects[shuffled][spread_order(objects[shuffled])], objects[order])
 
 
+def test_a_grid_of_more_objects_than_draws_is_whole_too():
+    order = spread_order(grid(9, 9, 9, 9))
+    assert sorted(order) == list(range(6561))
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.integers(1, 6), min_size=1, max_size=4))
 def test_it_is_a_permutation_of_any_grid(sizes):

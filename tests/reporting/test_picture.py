@@ -149,7 +149,7 @@ def test_bodies_of_unknown_size_are_drawn_as_axes(scene, detect, sizeless, flang
             assert (np.abs(patch - wanted).max(1) < 12).any() == drawn, (body, colour)
 
 
-def test_axes_behind_the_camera_are_left_out(scene, detect, sizeless, flange, tmp_path):
+def test_axes_behind_the_camera_are_left_out(scene, detect, sizeless, flange, tmp_path, view):
     found = sizeless(detect([0, 1, 2]))
     t = found.t.clone()
     t[0, 2], t[1, 2] = -0.5, 0.01
@@ -158,7 +158,11 @@ def test_axes_behind_the_camera_are_left_out(scene, detect, sizeless, flange, tm
         pixels = np.asarray(picture.convert("RGB")).astype(int)
     wanted = [int(AXIS_COLOURS[0][i : i + 2], 16) for i in (1, 3, 5)]
     where = np.argwhere(np.abs(pixels - wanted).max(2) < 12)
-    assert len(where) > 20 and np.ptp(where[:, 0]) < 12  # one line along x
+    # one line, the last body's x
+    (start, row), (end, _) = view.project(scene.t[[2, 2]] + [[0, 0, 0], [0.018, 0, 0]])
+    assert len(where) > 20 and np.abs(where[:, 0] - 64 - row).max() < 6
+    column = where[:, 1] - (SIZE[0] - PANEL - 8)
+    assert column.min() > start - 6 and abs(column.max() - end) < 6
 
 
 def test_the_caption_tells_axes_from_what_is_not_drawn(scene, detect):

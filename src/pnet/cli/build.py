@@ -74,7 +74,7 @@ def share(value: object) -> float:
     """A share such as 0.2 or 1/5, as a number."""
     try:
         return float(Fraction(str(value)))
-    except (ValueError, ZeroDivisionError):
+    except (ValueError, ZeroDivisionError, OverflowError):
         raise ValueError(f"data.learn is {value!r}, expected a share in (0, 1], for instance 1/3") from None
 
 

@@ -247,9 +247,7 @@ def changed(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any] | None:
             if inner is None:
                 return None
             changes[key] = inner
-        elif isinstance(value, dict) and was is not None:
-            return None
-        elif isinstance(value, list) and isinstance(was, dict):
+        elif isinstance(value, dict | list) and was is not None and type(was) is not type(value):
             return None
         else:
             changes[key] = value
