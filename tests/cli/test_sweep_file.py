@@ -134,12 +134,12 @@ def test_the_rows_that_are_trained_are_the_papers_and_the_two_rules():
     assert trained("table2") == {**both, "PPR-Net with ICP": ("method=pprnet_icp",)}
     assert trained("table3") == both
     assert trained("table5") == {
-        "ParametricNet (w/o GU)": ("ablation=no_gu",),
-        "ParametricNet (w/o RF)": ("ablation=no_rf",),
-        "ParametricNet (w/o M_V)": ("ablation=no_mv",),
-        "ParametricNet": ("ablation=none",),
-        "Keypoints nearest to the camera": ("ablation=rule_camera",),
-        "Keypoints nearest to the point": ("ablation=rule_point",),
+        "ParametricNet (w/o GU)": ("method=parametricnet", "ablation=no_gu"),
+        "ParametricNet (w/o RF)": ("method=parametricnet", "ablation=no_rf"),
+        "ParametricNet (w/o M_V)": ("method=parametricnet", "ablation=no_mv"),
+        "ParametricNet": ("method=parametricnet", "ablation=none"),
+        "Keypoints nearest to the camera": ("method=parametricnet", "ablation=rule_camera"),
+        "Keypoints nearest to the point": ("method=parametricnet", "ablation=rule_point"),
     }
     own = {row.name for table in read_sweep("all") for row in table.rows if row.origin == "ours"}
     assert own == {"Keypoints nearest to the camera", "Keypoints nearest to the point"}

@@ -10,7 +10,7 @@ import pytest
 
 from pnet.data.scene_folder import SceneFolder
 from pnet.records import SceneId
-from pnet.scenes.generation import MANIFEST
+from pnet.scenes.manifest import MANIFEST
 from pnet.scenes.store import CycleFile, CycleHeader, write_cycle
 
 

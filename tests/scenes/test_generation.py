@@ -13,15 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from pnet.scenes.generation import (
-    MANIFEST,
-    Summary,
-    cycle_path,
-    generate,
-    open_root,
-    read_manifest,
-    settings_fingerprint,
-)
+from pnet.scenes.generation import Summary, cycle_path, generate, open_root
+from pnet.scenes.manifest import MANIFEST, read_manifest, settings_fingerprint
 from pnet.scenes.protocol import CycleTask, Protocol, SplitPlan
 from pnet.scenes.store import CycleFile
 

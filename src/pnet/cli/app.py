@@ -5,7 +5,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
@@ -47,6 +47,16 @@ def key_of(override: str) -> str:
     return override.split("=", 1)[0].lstrip("+~")
 
 
+def config_flags(arguments: Sequence[str]) -> list[str]:
+    """The flags by which the user brings configs of his own; each job needs them too."""
+    found: list[str] = []
+    for i, word in enumerate(arguments):
+        name, _, value = word.partition("=")
+        if name in ("--config-dir", "-cd", "--config-name", "-cn"):
+            found += [name, value or arguments[i + 1]]
+    return found
+
+
 def hydra_value(value: Any) -> str:
     """Plain values as an override's right side."""
     match value:
@@ -59,8 +69,9 @@ def hydra_value(value: Any) -> str:
         case list() | tuple():
             return "[" + ",".join(map(hydra_value, value)) + "]"
         case str():
-            escaped = value.replace("\\", "\\\\").replace("'", "\\'")
-            return f"'{escaped}'"
+            # Hydra takes a backslash as it is, except before a quote
+            escaped = re.sub(r"(\\*)'", r"\1\1\\'", value)
+            return "'" + re.sub(r"(\\+)$", r"\1\1", escaped) + "'"
         case _:
             return repr(value)
 

@@ -23,6 +23,7 @@ from pnet.postprocess.vote import MeanVote
 if TYPE_CHECKING:
     from pnet.engine.estimator import Estimator, NetworkEstimator, Recovery
 
+AVERAGING = "pnet.postprocess.pose_average.PoseAveraging"
 UNLEARNT = ("learning", "generalization", "sections")  # keys of a part that weights don't depend on
 
 
@@ -40,6 +41,7 @@ def build_parts(cfg: DictConfig) -> Parts:
     """Part, network and recovery of a config; the network's weights are drawn from its seed."""
     torch.manual_seed(cfg.seed)
     part: ParametricPart = instantiate(cfg.part)
+    check_ablations(cfg)
     recovery = instantiate(cfg.postprocess)
     plain_means = isinstance(recovery, PoseRecovery) and isinstance(recovery.voting, MeanVote)
     if cfg.data.targets.rule == KeypointRule.POINT and plain_means:
@@ -50,6 +52,16 @@ def build_parts(cfg: DictConfig) -> Parts:
     backbone = instantiate(cfg.backbone)
     network = instantiate(cfg.model, backbone=backbone, keypoints=len(part.chain))
     return Parts(part, network.to(memory_format=torch.channels_last), backbone, recovery)
+
+
+def check_ablations(cfg: DictConfig) -> None:
+    """Raise ValueError where an ablation of ParametricNet's votes is asked of a method that has none."""
+    for key in ("radius_filter", "voting"):
+        if cfg.postprocess._target_ == AVERAGING and key in cfg.postprocess:
+            raise ValueError(
+                f"postprocess.{key}: {cfg.method.name} takes no votes for keypoints; ablation=no_rf and "
+                "rule_point are ParametricNet's"
+            )
 
 
 def build_data(cfg: DictConfig, parts: Parts) -> SceneDataModule:

@@ -72,6 +72,7 @@ def evaluate(cfg: DictConfig) -> None:
     import torch
     from rich.console import Console
 
+    from pnet.engine.locks import hold
     from pnet.reporting.tables import metrics_table
 
     if cfg.stage not in ("predict", "score", "all"):
@@ -84,13 +85,15 @@ def evaluate(cfg: DictConfig) -> None:
         torch.set_num_threads(cfg.threads)
     run = Path(cfg.run)
     trained = read_run(run)
-    if cfg.stage != "score":
-        predict(evaluation, run)
-    if cfg.stage != "predict":
+    with hold(run, f"another process works on {run}"):
+        if cfg.stage != "score":
+            predict(evaluation, run)
+        if cfg.stage == "predict":
+            return
         metrics = score(evaluation, run, trained)
-        out = Console(soft_wrap=True)
-        out.print(metrics_table(metrics))
-        out.print(f"written to {evaluation.folder(run)}; next: pnet-report run={run}")
+    out = Console(soft_wrap=True)
+    out.print(metrics_table(metrics))
+    out.print(f"written to {evaluation.folder(run)}; next: pnet-report run={run}")
 
 
 def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -105,7 +108,7 @@ def open_scenes(evaluation: Evaluation, trained: DictConfig) -> tuple["SceneFold
     """The scenes to evaluate, and the fingerprint of their data set."""
     from pnet.cli.build import identity
     from pnet.data.scene_folder import SceneFolder
-    from pnet.scenes.generation import read_manifest, settings_fingerprint
+    from pnet.scenes.manifest import read_manifest, settings_fingerprint
 
     root = evaluation.root or Path(trained.data.root)
     fingerprint = settings_fingerprint(read_manifest(root))
@@ -135,7 +138,7 @@ def expected_header(evaluation: Evaluation, run: Path, trained: DictConfig, data
         "part": identity(trained)["part"],
         "split": evaluation.split,
         "data": data,
-        "weights": _weights_digest(run) if is_trained(trained) else "none",
+        "weights": _weights_digest(run) if is_trained(trained) else _method_digest(trained),
         "recovery": sha256(recovery.encode()).hexdigest()[:16],
     }
 
@@ -147,6 +150,12 @@ def _weights_digest(run: Path) -> str:
     if not weights.is_file():
         raise FileNotFoundError(f"{weights}: no checkpoint there; train first with pnet-train")
     return sha256(weights.read_bytes()).hexdigest()[:16]
+
+
+def _method_digest(trained: DictConfig) -> str:
+    """What stands for weights where a method has none: its settings and the part's."""
+    settings = [OmegaConf.to_yaml(node, resolve=True) for node in (trained.method.estimator, trained.part)]
+    return sha256("".join(settings).encode()).hexdigest()[:16]
 
 
 def is_current(evaluation: Evaluation, run: Path, trained: DictConfig) -> bool:
@@ -174,6 +183,8 @@ def predict(evaluation: Evaluation, run: Path) -> None:
 
     trained = read_run(run)
     estimator = load_estimator(run, recovery_settings(evaluation, trained))
+    for name in ("metrics.json", "curve.json"):  # they are of other predictions
+        (evaluation.folder(run) / name).unlink(missing_ok=True)
     scenes, data = open_scenes(evaluation, trained)
     expected = expected_header(evaluation, run, trained, data)
     with count_progress(f"predicting {evaluation.name}", len(scenes), "scenes") as advance:

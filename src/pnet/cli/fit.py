@@ -30,7 +30,7 @@ def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
     from pnet.engine.tensorboard import add_settings
     from pnet.engine.training import PoseTraining, check_identity
     from pnet.models.summary import summarise
-    from pnet.scenes.generation import read_manifest, settings_fingerprint
+    from pnet.scenes.manifest import read_manifest, settings_fingerprint
 
     if cfg.trainer.threads is not None:
         torch.set_num_threads(cfg.trainer.threads)
@@ -63,7 +63,7 @@ def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
         if cfg.ckpt == "auto":
             check_same_settings(run, cfg)
         if is_finished(run, cfg.trainer.steps):
-            return read_json(run / METRICS)
+            return read_json(run / METRICS)  # evaluations keep the post-processing of the run
     if not is_helper():
         begin_run(cfg, run)
     full = validation[len(validation) - 1]  # cycles end with a full bin
@@ -91,8 +91,8 @@ def is_helper() -> bool:
 
 def begin_run(cfg: DictConfig, run: Path) -> None:
     """Write what the run is made of; metrics.json of an earlier one goes."""
-    from pnet.engine.provenance import provenance, write_json
-    from pnet.scenes.generation import MANIFEST, read_manifest
+    from pnet.engine.provenance import commit_text, provenance, write_json
+    from pnet.scenes.manifest import MANIFEST, read_manifest
     from pnet.scenes.store import write_atomically
 
     data = read_manifest(Path(cfg.data.root))
@@ -101,7 +101,20 @@ def begin_run(cfg: DictConfig, run: Path) -> None:
     write_json(run / MANIFEST, data)  # how the data was made, so that the folder is enough to repeat the run
     write_atomically(run / CONFIG, OmegaConf.to_yaml(cfg).encode())
     write_atomically(run / RESOLVED, OmegaConf.to_yaml(cfg, resolve=True).encode())
-    write_json(run / "provenance.json", provenance(cfg.seed))
+    state = provenance(cfg.seed)
+    commit = commit_text(state["git"])
+    before = earlier_commits(run) if (run / "checkpoints").is_dir() else []
+    write_json(run / "provenance.json", {**state, "commits": list(dict.fromkeys([*before, commit]))})
+
+
+def earlier_commits(run: Path) -> list[str]:
+    """Of a training that goes on, the code versions that it has seen."""
+    from pnet.engine.provenance import read_json
+
+    try:
+        return [str(commit) for commit in read_json(run / "provenance.json")["commits"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
 
 
 def quiet_lightning() -> None:
@@ -146,7 +159,7 @@ def is_finished(run: Path, steps: int) -> bool:
 
 def check_same_settings(run: Path, cfg: DictConfig) -> None:
     """Raise ValueError where a run was begun with other settings than these; names the first few."""
-    from pnet.scenes.generation import differences
+    from pnet.scenes.manifest import differences
 
     differing = sorted(differences(training_settings(read_run(run)), training_settings(cfg)))
     if differing:

@@ -91,7 +91,8 @@ def manifest_of(settings: dict[str, Any], tasks: list["CycleTask"]) -> dict[str,
 def is_complete(cfg: DictConfig) -> bool:
     """Whether the data set of these settings is there with all its files."""
     from pnet.cli.instantiate import instantiate
-    from pnet.scenes.generation import MANIFEST, cycle_path, read_manifest
+    from pnet.scenes.generation import cycle_path
+    from pnet.scenes.manifest import MANIFEST, read_manifest
 
     root = Path(cfg.data.root)
     if not (root / MANIFEST).is_file():
@@ -113,7 +114,7 @@ def build_factory(cfg: DictConfig, settings: dict[str, Any]) -> "SceneFactory":
     """Everything that scenes are made from, out of the config."""
     from pnet.cli.instantiate import instantiate
     from pnet.scenes.factory import SceneFactory
-    from pnet.scenes.generation import settings_fingerprint
+    from pnet.scenes.manifest import settings_fingerprint
 
     return SceneFactory(
         part=instantiate(cfg.part),

@@ -12,12 +12,16 @@ import yaml  # type: ignore[import-untyped]
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from omegaconf import OmegaConf, open_dict
 
 from pnet.cli.app import hydra_value, key_of
+from pnet.cli.data_set import data_overrides
 from pnet.cli.evaluate import Evaluation, wanted_evaluations
+from pnet.cli.generate import making_settings
 from pnet.cli.settings import DECIDE_NOTHING, METRICS, RESOLVED, training_settings
 from pnet.cli.sweep_file import CellPlan, TablePlan
+from pnet.scenes.manifest import MANIFEST, settings_fingerprint
 
 RUNS = Path("outputs/train")
 
@@ -43,11 +47,32 @@ class Job:
     cells: list[str] = field(default_factory=list)
 
     def missing(self) -> list[str]:
-        """What is not there yet: "training", and names of evaluations; from the run's metrics.json."""
+        """What is not there yet: "training", and names of evaluations; from the run's metrics.json.
+
+        A run of other settings in the folder, or on other data, counts as missing: the job itself says then
+        what is wrong.
+        """
         metrics = read_metrics(self.run)
-        if metrics is None or metrics["steps"] < self.steps:
+        if metrics is None or metrics["steps"] < self.steps or not self._is_own():
             return ["training", *self.evaluations]
-        return [name for name in self.evaluations if name not in metrics["evaluations"]]
+        data = read_json_object(Path(self.settings["data"]["root"]) / MANIFEST)
+        now = None if data is None else settings_fingerprint(data)
+        done = metrics["evaluations"]
+        # data that is gone leaves the figures as they are
+        return [n for n in self.evaluations if n not in done or now not in (None, done[n].get("data"))]
+
+    def _is_own(self) -> bool:
+        """Whether the folder's run has this job's settings, and was trained on the data that is asked for."""
+        if read_settings(self.run) != self.settings:
+            return False
+        made = read_json_object(self.run / MANIFEST)
+        there = read_json_object(Path(self.settings["data"]["root"]) / MANIFEST)
+        if made is not None and there is not None and made != there:
+            return False
+        if self.generate is None or made is None:
+            return True
+        wanted = making(tuple(data_overrides(self.overrides, self.settings["data"]["root"], self.generate)))
+        return {key: made.get(key) for key in wanted} == wanted
 
     def command(self) -> list[str]:
         """Overrides with which pnet-train does all of it, or what is missing."""
@@ -155,7 +180,12 @@ def sweep_jobs(tables: Sequence[TablePlan], arguments: Sequence[str]) -> list[Jo
                 job = find_job(overrides, own_data(overrides, cell), jobs, index)
                 add_cell(job, cell, overrides)
     if not jobs:
-        raise ValueError(f"no cell of the sweep has {' '.join(arguments)}")
+        keys = {key_of(word) for table in tables for cell in table.cells() for word in cell.overrides}
+        chosen = [word for word in arguments if key_of(word) in keys]
+        raise ValueError(
+            f"no cell of the sweep has {' and '.join(chosen)}: it sweeps {', '.join(sorted(keys))} itself, "
+            "so a value of these selects cells"
+        )
     return jobs
 
 
@@ -183,10 +213,12 @@ def find_job(
         if job.settings == whole.settings:
             return job
     run = index.find(whole.settings)
-    named = deciding(overrides, whole.settings)
-    if run is None:
-        run = composed(named).run
-    trained_with = index.postprocess.get(run, composed(named).postprocess)
+    if run is not None and read_metrics(run) is not None:  # it has ended and keeps its post-processing
+        named, trained_with = overrides, index.postprocess[run]
+    else:
+        named = deciding(overrides, whole.settings)
+        trained_with = composed(named).postprocess
+        run = run or composed(named).run
     asked = {evaluation.name: evaluation for evaluation in whole.evaluations}
     job = Job(named, run, whole.settings, trained_with, whole.steps, generate, asked)
     known.append(job)
@@ -208,8 +240,11 @@ def deciding(overrides: Sequence[str], settings: dict[str, Any]) -> tuple[str, .
         rest = [other for other in kept if other != word]
         if key_of(word) in ("part", "protocol", "data.root", *DECIDE_NOTHING):
             continue
-        if composed(tuple(rest)).settings == settings:
-            kept = rest
+        try:
+            if composed(tuple(rest)).settings == settings:
+                kept = rest
+        except HydraException:  # another override sets a key that only this one brings
+            continue
     return tuple(kept)
 
 
@@ -285,6 +320,32 @@ class RunIndex:
         for run in sorted(equal, key=lambda run: read_metrics(run) is None):
             found.setdefault(self.settings[run]["seed"], run)
         return list(found.values())
+
+
+def read_settings(run: Path) -> dict[str, Any] | None:
+    """What a run's training depended on; None where it is of another version, damaged or not there."""
+    try:
+        content = yaml.load(
+            (run / RESOLVED).read_text(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+        )
+        return training_settings(content)
+    except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError, AttributeError):
+        return None
+
+
+@lru_cache(maxsize=256)
+def making(overrides: tuple[str, ...]) -> dict[str, Any]:
+    """The settings by which pnet-generate would make a data set."""
+    return making_settings(compose("generate", overrides=list(overrides)))
+
+
+def read_json_object(path: Path) -> dict[str, Any] | None:
+    """A JSON file's object; None where it is not there or damaged."""
+    try:
+        content = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return None
+    return content if isinstance(content, dict) else None
 
 
 def read_metrics(run: Path) -> dict[str, Any] | None:

@@ -1,6 +1,7 @@
 """Jobs one after another, each in a process of its own."""
 
 import importlib
+import multiprocessing
 import os
 import signal
 import sys
@@ -8,11 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from threading import Thread
 
 from hydra.core.utils import JobReturn, JobStatus
 
-from pnet.cli.app import CommandFailed
+from pnet.cli.app import CommandFailed, config_flags
 from pnet.engine.locks import NO_WAIT, Busy
 
 # of Hydra's own settings those that make a multirun; a job is a single run
@@ -64,16 +66,6 @@ def run_one_by_one(
     return [job_return(found[number], overrides) for number, overrides in enumerate(jobs)]
 
 
-def config_flags(arguments: Sequence[str]) -> list[str]:
-    """The flags by which the user brings configs of his own; each job needs them too."""
-    found: list[str] = []
-    for i, word in enumerate(arguments):
-        name, _, value = word.partition("=")
-        if name in ("--config-dir", "-cd", "--config-name", "-cn"):
-            found += [name, value or arguments[i + 1]]
-    return found
-
-
 def run_in_process(command: str, overrides: Sequence[str], wait: bool = True) -> Outcome:
     """Run a command in a process of its own and wait for its end."""
     context = get_context("forkserver")
@@ -88,7 +80,7 @@ def run_in_process(command: str, overrides: Sequence[str], wait: bool = True) ->
     except EOFError:  # it ended without a word
         outcome = None
     except KeyboardInterrupt:
-        process.join()
+        _end(process)
         raise
     process.join()
     return outcome or Outcome(_ending(process.exitcode))
@@ -105,6 +97,8 @@ def job_return(outcome: Outcome, overrides: Sequence[str]) -> JobReturn:
 
 def _job(command: str, overrides: list[str], wait: bool, sender: "Connection") -> None:
     """A job's process: says how it ended. Its own output goes where the sweep's goes."""
+    # of a fork server's child the loader's workers would not see the end
+    multiprocessing.set_start_method("fork", force=True)
     Thread(target=_end_with_parent, daemon=True).start()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # what is nobody's mistake but ours keeps its name and traceback
     os.environ.pop(NO_WAIT, None)
@@ -113,6 +107,9 @@ def _job(command: str, overrides: list[str], wait: bool, sender: "Connection") -
     sys.argv = [f"pnet-{command}", *overrides]
     try:
         importlib.import_module(f"pnet.cli.{command}").main()
+    except Busy as fault:  # under PNET_TRACEBACK=1
+        sender.send(Outcome(str(fault), busy=True))
+        raise
     except CommandFailed as fault:
         sender.send(Outcome(fault.text, isinstance(fault.__cause__, Busy)))
         raise
@@ -120,9 +117,21 @@ def _job(command: str, overrides: list[str], wait: bool, sender: "Connection") -
         sender.send(Outcome("interrupted" if fault.code == 130 else f"exit code {fault.code}"))
         raise
     except BaseException as fault:
-        sender.send(Outcome(f"{type(fault).__name__}: {fault}"))
+        text = " ".join(str(fault).split())
+        sender.send(Outcome(f"{type(fault).__name__}: {text}" if text else type(fault).__name__))
         raise
     sender.send(Outcome(None))
+
+
+def _end(process: BaseProcess) -> None:
+    """End a job that an interruption may have reached already (Ctrl-C does) or not."""
+    process.join(3)
+    if process.is_alive() and process.pid is not None:
+        os.kill(process.pid, signal.SIGINT)
+        process.join(30)
+    if process.is_alive():
+        process.terminate()
+        process.join()
 
 
 def _end_with_parent() -> None:

@@ -61,7 +61,7 @@ def report(cfg: DictConfig) -> None:
 
 def data_root(fingerprint: str, root: Path) -> Path:
     """The data folder, if it holds the data that was predicted."""
-    from pnet.scenes.generation import read_manifest, settings_fingerprint
+    from pnet.scenes.manifest import read_manifest, settings_fingerprint
 
     if settings_fingerprint(read_manifest(root)) != fingerprint:
         raise ValueError(

@@ -3,13 +3,14 @@
 import sys
 from collections.abc import Iterator, Sequence
 from statistics import median
+from typing import Any
 
-import yaml  # type: ignore[import-untyped]
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
 from rich.console import Console
 
-from pnet.cli.app import key_of
+from pnet.cli.app import EXPECTED, fail, key_of
 from pnet.cli.jobs import RUNS, Job, plain_jobs, read_metrics, sweep_jobs
 from pnet.cli.settings import recipe_text
 from pnet.cli.sweep_file import read_sweep
@@ -26,12 +27,13 @@ def sweep(arguments: Sequence[str], launcher: Launcher) -> list[JobReturn]:
     Raises:
         SystemExit: with code 1 where a job failed; all are listed with their reasons.
     """
-    jobs = planned_jobs(arguments)
+    try:
+        jobs = planned_jobs(arguments)
+        dry = any(asked(arguments, DRY_RUN))
+    except EXPECTED as fault:  # Hydra would print a traceback
+        fail(fault)
     missing = [job for job in jobs if job.missing()]
     out = Console(soft_wrap=True)
-    dry = [yaml.safe_load(word.split("=", 1)[1]) for word in arguments if key_of(word) == DRY_RUN][-1:] == [
-        True
-    ]
     if dry:
         out.print(f"runs in {RUNS}:", *job_lines(jobs), sep="\n", markup=False, highlight=False)
     out.print(
@@ -52,9 +54,25 @@ def sweep(arguments: Sequence[str], launcher: Launcher) -> list[JobReturn]:
 
 def planned_jobs(arguments: Sequence[str]) -> list[Job]:
     """The jobs of a multirun's overrides."""
-    named = [word.split("=", 1)[1] for word in arguments if key_of(word) == SWEEP]
+    named = [str(value) for value in asked(arguments, SWEEP)]
     further = [word for word in arguments if key_of(word) not in (SWEEP, DRY_RUN)]
-    return sweep_jobs(read_sweep(named[-1]), further) if named else plain_jobs(further)
+    jobs = sweep_jobs(read_sweep(",".join(named)), further) if named else plain_jobs(further)
+    for job in jobs:
+        if job.settings["trainer"]["devices"] != 1:
+            raise ValueError("trainer.devices: a job of a multirun has one; train on several outside of it")
+    return jobs
+
+
+def asked(arguments: Sequence[str], key: str) -> list[Any]:
+    """The values that the arguments give a key, as Hydra reads them."""
+    words = [word for word in arguments if key_of(word) == key]
+    found: list[Any] = []
+    for override in OverridesParser.create().parse_overrides(words):
+        if override.is_sweep_override():
+            found += list(override.sweep_iterator())
+        else:
+            found.append(override.value())
+    return [getattr(value, "text", value) for value in found if value is not None]
 
 
 def launch(jobs: Sequence[Job], launcher: Launcher) -> tuple[dict[int, str], list[JobReturn]]:
@@ -62,7 +80,8 @@ def launch(jobs: Sequence[Job], launcher: Launcher) -> tuple[dict[int, str], lis
     try:
         returns = list(launcher.launch([job.command() for job in jobs], initial_job_idx=0))
     except Exception as fault:  # of a launcher that is not ours: which jobs are done is seen in their folders
-        reason = " ".join(str(fault).split()) or type(fault).__name__
+        text = " ".join(str(fault).split()) or type(fault).__name__
+        reason = f"not done when the launcher stopped: {text[-300:]}"
         return dict.fromkeys(range(len(jobs)), reason), []
     failed = [(i, found) for i, found in enumerate(returns) if found.status is JobStatus.FAILED]
     return {i: " ".join(str(found._return_value).split()) for i, found in failed}, returns

@@ -9,9 +9,17 @@ from typing import TYPE_CHECKING, Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from pnet.cli.app import key_of, run_app
-from pnet.cli.jobs import RunIndex, cell_evaluation, composed, read_metrics, restricted
+from pnet.cli.app import key_of, run_app, short_name
+from pnet.cli.jobs import (
+    RunIndex,
+    cell_evaluation,
+    composed,
+    read_json_object,
+    read_metrics,
+    restricted,
+)
 from pnet.cli.sweep_file import CellPlan, TablePlan, read_sweep
+from pnet.scenes.manifest import MANIFEST, settings_fingerprint
 
 if TYPE_CHECKING:
     from pnet.reporting.paper_table import PaperTable, RunFacts
@@ -36,17 +44,24 @@ def table(cfg: DictConfig) -> None:
     out, folder = Console(soft_wrap=True), Path(cfg.output)
     index = RunIndex(Path(cfg.runs))
     for plan in read_sweep(sweep_name(str(cfg.table))):
-        found = collect(plan, words, index, cfg.protocol.name)
+        found = collect(plan, words, index, " ".join([cfg.protocol.name, *further(words)]))
         out.print(rich_table(found))
         folder.mkdir(parents=True, exist_ok=True)
-        stem = folder / f"table_{plan.number}_{cfg.protocol.name}"
+        stem = folder / short_name(
+            "_".join([f"table_{plan.number}", cfg.protocol.name, *further(words)]).replace("=", "-")
+        )
         for ending, text in (("md", markdown(found)), ("csv", csv_text(found)), ("tex", latex(found))):
-            write_atomically(stem.with_suffix(f".{ending}"), text.encode())
-        chart(found, stem.with_suffix(".png"))
+            write_atomically(stem.with_name(f"{stem.name}.{ending}"), text.encode())
+        chart(found, stem.with_name(f"{stem.name}.png"))
         for line in found.missing:
             out.print(f"· {line}", markup=False)
         out.print(standing(found))
         out.print(f"written to {stem}.md, .csv, .tex, .png\n")
+
+
+def further(words: Sequence[str]) -> list[str]:
+    """The overrides that tell this table from the plain one of its protocol."""
+    return [word for word in words if key_of(word) != "protocol"]
 
 
 def standing(table: "PaperTable") -> str:
@@ -69,19 +84,23 @@ def sweep_name(name: str) -> str:
     return ",".join(f"table{word}" if word.isdigit() else word for word in name.split(","))
 
 
+def _nested() -> dict[str, dict[str, set[Path]]]:
+    return defaultdict(lambda: defaultdict(set))
+
+
 @dataclass
 class Collected:
     """What was found for a table so far.
 
     Attributes:
-        missing: a line for each cell without a figure. serves: run → cells. data: part → fingerprint → runs.
+        missing: a line for each cell without a figure. serves: run → cells.
+        data, trained: part → fingerprint of the data scored or trained on → runs.
     """
 
     missing: list[str] = field(default_factory=list)
     serves: dict[Path, list[str]] = field(default_factory=lambda: defaultdict(list))
-    data: dict[str, dict[str, set[Path]]] = field(
-        default_factory=lambda: defaultdict(lambda: defaultdict(set))
-    )
+    data: dict[str, dict[str, set[Path]]] = field(default_factory=_nested)
+    trained: dict[str, dict[str, set[Path]]] = field(default_factory=_nested)
 
 
 def collect(plan: TablePlan, words: Sequence[str], index: RunIndex, protocol: str) -> "PaperTable":
@@ -105,6 +124,9 @@ def collect(plan: TablePlan, words: Sequence[str], index: RunIndex, protocol: st
         rows.append(Row(row.name, tuple(cells), row.origin))
     runs = tuple(run_facts(run, cells, index) for run, cells in collected.serves.items())
     notes = [plan.note] if plan.note else []
+    seeds = sorted({len(values) for values in ours.values() if values})
+    if len(seeds) > 1:
+        notes.append(f"cells are means of {seeds[0]} to {seeds[-1]} seeds")
     return PaperTable(
         number=plan.number,
         title=plan.title,
@@ -133,14 +155,21 @@ def values_of(
         if metrics is None:
             reason = f"{run} has not ended"
             continue
-        scores = metrics.get("evaluations", {}).get(evaluation.name)
-        value = None if scores is None else scores.get(cell.table.metric)
-        if value is None:
+        scores = metrics["evaluations"].get(evaluation.name)
+        if scores is None:
             reason = f"{run} was not evaluated: {evaluation.name}"
+            continue
+        value = scores.get(cell.table.metric)
+        if value is None:
+            reason = f"{run} has no {cell.table.metric} of {evaluation.name}"
             continue
         found.append(float(value))
         collected.serves[run].append(cell.name)
-        collected.data[str(index.settings[run]["part"]["_target_"])][str(scores.get("data"))].add(run)
+        part = str(index.settings[run]["part"]["_target_"])
+        collected.data[part][str(scores.get("data"))].add(run)
+        made = read_json_object(run / MANIFEST)
+        if made is not None:
+            collected.trained[part][settings_fingerprint(made)].add(run)
     if not found:
         collected.missing.append(f"{cell.name}: {reason}")
     return tuple(found)
@@ -151,7 +180,6 @@ def run_facts(run: Path, cells: Sequence[str], index: RunIndex) -> "RunFacts":
     from pnet.reporting.paper_table import RunFacts
 
     metrics, settings, state = read_metrics(run) or {}, index.settings[run], provenance_of(run)
-    git = state.get("git", {})
     evaluations = metrics.get("evaluations", {}).values()
     fingerprints = sorted({str(scores.get("data")) for scores in evaluations})
     steps = int(metrics.get("steps") or 0)
@@ -160,24 +188,26 @@ def run_facts(run: Path, cells: Sequence[str], index: RunIndex) -> "RunFacts":
         folder=str(run),
         seed=int(settings["seed"]),
         steps=steps,
-        scene_iterations=steps * int(settings["data"]["batch_size"]),
+        scene_iterations=steps * int(settings["data"]["batch_size"]) * int(settings["trainer"]["devices"]),
         training_seconds=metrics.get("training_seconds"),
         parameters=(metrics.get("network") or {}).get("parameters"),
         device=f"{state.get('device', 'unknown')}, {state.get('threads', '?')} threads",
-        commit=str(git.get("commit", "unknown"))[:7] + ("+changes" if git.get("changed") else ""),
+        commit=", ".join(commits_of(state, list(evaluations))),
         data=f"{settings['data']['root']} ({', '.join(fingerprints)})",
     )
 
 
+def commits_of(state: dict[str, Any], evaluations: Sequence[dict[str, Any]]) -> list[str]:
+    """The code versions that trained and evaluated a run."""
+    git = state.get("git", {})
+    last = str(git.get("commit", "unknown"))[:7] + ("+changes" if git.get("changed") else "")
+    evaluated = [str(scores["commit"]) for scores in evaluations if "commit" in scores]
+    return list(dict.fromkeys([*state.get("commits", [last]), *evaluated]))
+
+
 def provenance_of(run: Path) -> dict[str, Any]:
     """A run's provenance.json; empty where it is not readable."""
-    import json
-
-    try:
-        content = json.loads((run / "provenance.json").read_text())
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
+    return read_json_object(run / "provenance.json") or {}
 
 
 def mixtures(runs: Sequence["RunFacts"], collected: Collected) -> list[str]:
@@ -187,18 +217,19 @@ def mixtures(runs: Sequence["RunFacts"], collected: Collected) -> list[str]:
     if len(commits) > 1:
         each = ", ".join(f"{commit} ({count} runs)" for commit, count in commits.most_common())
         found.append(f"the runs are of different code versions: {each}")
-    if any(commit.endswith("+changes") for commit in commits):
+    if any("+changes" in commit for commit in commits):
         found.append("some runs are of code with changes that are in no commit")
-    for package in ("torch", "numpy", "lightning", "pnet"):
+    for package in ("torch", "numpy", "lightning", "scikit-learn", "small_gicp", "pnet"):
         versions = {
             provenance_of(Path(run.folder)).get("packages", {}).get(package, "unknown") for run in runs
         }
         if len(versions) > 1:
             found.append(f"the runs are of different versions of {package}: {', '.join(sorted(versions))}")
-    for part, data in collected.data.items():
-        if len(data) > 1:
-            name = part.rsplit(".", 1)[-1]
-            found.append(f"the runs of {name} were scored on different data: {', '.join(sorted(data))}")
+    for what, parts in (("scored", collected.data), ("trained", collected.trained)):
+        for part, data in parts.items():
+            if len(data) > 1:
+                name = part.rsplit(".", 1)[-1]
+                found.append(f"the runs of {name} were {what} on different data: {', '.join(sorted(data))}")
     return found
 
 

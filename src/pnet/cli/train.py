@@ -6,11 +6,11 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from pnet.cli.app import run_app
+from pnet.cli.app import EXPECTED, error_text, run_app
 from pnet.cli.data_set import make_data, make_data_again, repeated
 from pnet.cli.evaluate import Evaluation, is_current, open_scenes, predict, score, wanted_evaluations
 from pnet.cli.fit import begin_run, fit, is_helper
-from pnet.cli.settings import METRICS, is_trained, read_run
+from pnet.cli.settings import METRICS, is_trained, read_run, training_settings
 
 
 def main() -> None:
@@ -23,8 +23,8 @@ def train(cfg: DictConfig) -> None:
     from pnet.engine.locks import hold
     from pnet.engine.provenance import read_json
 
-    if cfg.sweep is not None:
-        raise ValueError(f"sweep={cfg.sweep} declares several trainings: add --multirun")
+    if cfg.sweep is not None or cfg.dry_run:
+        raise ValueError("sweep= and dry_run= are about several trainings: add --multirun")
     if cfg.repeat is not None:
         cfg = repeated(cfg)
     run = Path(cfg.run_dir)
@@ -37,17 +37,26 @@ def train(cfg: DictConfig) -> None:
             make_data_again(cfg)
         elif cfg.data.generate is not None:
             make_data(cfg)
-        if is_trained(cfg):
-            metrics = fit(cfg, run)
-        else:
-            begin_run(cfg, run)
-            metrics = {"steps": 0, "training_seconds": 0.0, "scenes_per_second": None, "validation": {}}
+        metrics = fit(cfg, run) if is_trained(cfg) else without_training(cfg, run)
         if all(is_evaluated(metrics, evaluation, run) for evaluation in evaluations):
             if not (run / METRICS).is_file():
                 finish(cfg, run, metrics)
         else:
-            finish(cfg, run, with_evaluations(metrics, evaluations, run))
+            metrics, failed = evaluate_all(metrics, evaluations, run)
+            finish(cfg, run, metrics)
+            if failed:
+                raise ValueError("; ".join(failed))
         print_end(run, read_json(run / METRICS))
+
+
+def without_training(cfg: DictConfig, run: Path) -> dict[str, Any]:
+    """The metrics to begin with of a method that needs no training; those there where nothing has changed."""
+    from pnet.engine.provenance import read_json
+
+    if (run / METRICS).is_file() and training_settings(read_run(run)) == training_settings(cfg):
+        return read_json(run / METRICS)
+    begin_run(cfg, run)
+    return {"steps": 0, "training_seconds": 0.0, "scenes_per_second": None, "validation": {}}
 
 
 def is_evaluated(metrics: dict[str, Any], evaluation: Evaluation, run: Path) -> bool:
@@ -55,23 +64,39 @@ def is_evaluated(metrics: dict[str, Any], evaluation: Evaluation, run: Path) -> 
     return evaluation.name in metrics.get("evaluations", {}) and is_current(evaluation, run, read_run(run))
 
 
-def with_evaluations(metrics: dict[str, Any], evaluations: list[Evaluation], run: Path) -> dict[str, Any]:
-    """The metrics of a run, and those of its evaluations; what is there already is not done again."""
-    from pnet.engine.provenance import read_json
+def evaluate_all(
+    metrics: dict[str, Any], evaluations: list[Evaluation], run: Path
+) -> tuple[dict[str, Any], list[str]]:
+    """Do the evaluations that are not there yet; one that fails keeps nothing from the others.
 
-    trained, done = read_run(run), dict(metrics.get("evaluations", {}))
+    Returns:
+        the run's metrics with all that ended; a line about each that failed.
+    """
+    trained, done, failed = read_run(run), dict(metrics.get("evaluations", {})), []
     for evaluation in evaluations:
-        if not is_current(evaluation, run, trained):
-            predict(evaluation, run)
-            score(evaluation, run, trained)
-        found = read_json(evaluation.folder(run) / METRICS)
-        done[evaluation.name] = {
-            "split": evaluation.split,
-            "postprocess": evaluation.postprocess,
-            "data": open_scenes(evaluation, trained)[1],
-            **found,
-        }
-    return {**metrics, "evaluations": done}
+        try:
+            if not is_current(evaluation, run, trained):
+                done.pop(evaluation.name, None)
+                predict(evaluation, run)
+                score(evaluation, run, trained)
+            if evaluation.name not in done:
+                done[evaluation.name] = evaluation_entry(evaluation, run, trained)
+        except EXPECTED as fault:
+            failed.append(f"{evaluation.name}: {error_text(fault)}")
+    return {**metrics, "evaluations": done}, failed
+
+
+def evaluation_entry(evaluation: Evaluation, run: Path, trained: DictConfig) -> dict[str, Any]:
+    """What metrics.json keeps of an evaluation: how, on what and by which code, and its metrics."""
+    from pnet.engine.provenance import commit_text, git_state, read_json
+
+    return {
+        "split": evaluation.split,
+        "postprocess": evaluation.postprocess,
+        "data": open_scenes(evaluation, trained)[1],
+        "commit": commit_text(git_state(Path(__file__).parent)),
+        **read_json(evaluation.folder(run) / METRICS),
+    }
 
 
 def finish(cfg: DictConfig, run: Path, metrics: dict[str, Any]) -> None:

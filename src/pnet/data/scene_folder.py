@@ -6,7 +6,7 @@ from itertools import accumulate
 from pathlib import Path
 
 from pnet.records import Scene, SceneId
-from pnet.scenes.generation import MANIFEST, read_manifest
+from pnet.scenes.manifest import MANIFEST, read_manifest
 from pnet.scenes.store import SUFFIX, CycleFile
 
 

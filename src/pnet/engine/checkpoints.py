@@ -35,6 +35,9 @@ class ResumableCheckpoint(Checkpoint):
             trainer.save_checkpoint(temporary)  # every process calls it, the first writes
             if trainer.is_global_zero:
                 os.replace(temporary, self.path)
+        except OSError as fault:  # the library names a temporary file elsewhere
+            temporary.unlink(missing_ok=True)
+            raise OSError(f"{self.path}: could not be written ({fault.strerror or fault})") from fault
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise

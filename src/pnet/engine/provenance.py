@@ -20,6 +20,7 @@ PACKAGES = (
     "numpy",
     "scipy",
     "scikit-learn",
+    "small_gicp",
     "trimesh",
     "manifold3d",
     "embreex",
@@ -41,6 +42,11 @@ def provenance(seed: int) -> dict[str, Any]:
         "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
         "threads": torch.get_num_threads(),
     }
+
+
+def commit_text(git: dict[str, Any]) -> str:
+    """A commit for people: its beginning, and whether files were changed since."""
+    return str(git.get("commit", "unknown"))[:7] + ("+changes" if git.get("changed") else "")
 
 
 def package_versions() -> dict[str, str]:

@@ -20,8 +20,8 @@ class RotationNorm(StrEnum):
 class PoseLoss:
     """Weighted sum of three absolute errors; what a hidden body is taught counts less.
 
-    The rotation's error is the sum of the entries of |(R − R̂ g) Λ| with the symmetry element g of the part
-    for which it is smallest; for a revolution that of λ (R − R̂ g) e_z. The part declares its symmetry.
+    The rotation's error is the size of (R − R̂ g) Λ with the symmetry element g of the part for which it is
+    smallest; for a revolution that of λ (R − R̂ g) e_z. The part declares its symmetry.
 
     Args:
         part: whose symmetry counts.
@@ -33,7 +33,7 @@ class PoseLoss:
     def __init__(
         self,
         part: ParametricPart,
-        norm: str = "entries",
+        norm: str = "distance",
         centroid: float = 200.0,
         rotation: float = 200.0,
         visibility: float = 50.0,

@@ -6,7 +6,6 @@ import signal
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from dataclasses import astuple, dataclass, field
-from hashlib import sha256
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from threading import Thread
@@ -14,10 +13,9 @@ from time import perf_counter
 from typing import Any
 
 from pnet.scenes.factory import SceneFactory, StageTimes
+from pnet.scenes.manifest import MANIFEST, differences, read_manifest
 from pnet.scenes.protocol import CycleTask
 from pnet.scenes.store import SUFFIX, TEMPORARY, CycleFile, write_atomically, write_cycle
-
-MANIFEST = "dataset.json"
 
 
 @dataclass(frozen=True)
@@ -62,11 +60,6 @@ class Summary:
         )
 
 
-def settings_fingerprint(settings: Mapping[str, Any]) -> str:
-    """Digest of plain settings; equal settings give equal digests."""
-    return sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
-
-
 def cycle_path(root: Path, task: CycleTask) -> Path:
     """Where a task's file lies."""
     return root / task.split / (task.scene_id(0).file_stem + SUFFIX)
@@ -93,22 +86,6 @@ def open_root(root: Path, settings: Mapping[str, Any]) -> None:
     for left_over in root.rglob(f".*{TEMPORARY}"):
         if not _is_running(left_over):
             left_over.unlink(missing_ok=True)
-
-
-def read_manifest(root: Path) -> dict[str, Any]:
-    """The settings that made a data set."""
-    manifest = root / MANIFEST
-    try:
-        settings = json.loads(manifest.read_text())
-    except FileNotFoundError:
-        raise FileNotFoundError(
-            f"{manifest}: no data set there; run pnet-generate with the same part and protocol first"
-        ) from None
-    except json.JSONDecodeError as fault:
-        raise ValueError(f"{manifest}: not readable ({fault}); make the data set anew") from fault
-    if not isinstance(settings, dict):
-        raise ValueError(f"{manifest}: not a data set's manifest; make the data set anew")
-    return settings
 
 
 def generate(
@@ -221,12 +198,3 @@ def _is_running(temporary: Path) -> bool:
     except PermissionError:
         return True
     return True
-
-
-def differences(old: Any, new: Any, path: str = "") -> Iterator[str]:
-    """Where two nested settings differ, as "key was 1, now 2"."""
-    if isinstance(old, Mapping) and isinstance(new, Mapping):
-        for key in {*old, *new}:
-            yield from differences(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
-    elif old != new:
-        yield f"{path} was {old!r}, now {new!r}"
