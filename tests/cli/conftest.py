@@ -9,8 +9,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 
 import pnet
+from pnet.cli.app import config_dir
 
 
 class Outcome(NamedTuple):
@@ -133,3 +137,14 @@ def smoke_copy(smoke, tmp_path) -> SmokeRun:
 
     shutil.copytree(smoke.folder, tmp_path / "job")
     return SmokeRun(tmp_path / "job", smoke.outcomes)
+
+
+@pytest.fixture
+def hydra_app(tmp_path, monkeypatch):
+    """As inside a command: composing works, and the working directory is empty."""
+    monkeypatch.chdir(tmp_path)
+    GlobalHydra.instance().clear()
+    outer = HydraConfig.instance().cfg
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        yield
+    HydraConfig.instance().cfg = outer

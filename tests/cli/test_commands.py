@@ -16,6 +16,8 @@ from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
+from pnet.cli.evaluate import Evaluation, is_current
+from pnet.cli.settings import read_run
 from pnet.data.scene_folder import SceneFolder
 from pnet.engine.checkpoints import read_checkpoint
 from pnet.engine.predictions import read_predictions
@@ -130,7 +132,7 @@ def test_tensorboard_holds_what_is_watched(smoke):
 def test_evaluation_leaves_predictions_curve_and_metrics(smoke):
     folder = smoke.run / "evaluation" / "test_l"
     metrics, curve = (json.loads((folder / name).read_text()) for name in ("metrics.json", "curve.json"))
-    assert set(metrics) == METRICS and metrics["scenes"] == 3
+    assert set(metrics) == METRICS | {"predictions"} and metrics["scenes"] == 3
     assert (
         curve["recall"][0] == 0
         and curve["precision"][0] == 1
@@ -139,6 +141,18 @@ def test_evaluation_leaves_predictions_curve_and_metrics(smoke):
     header, found = read_predictions(folder / "predictions.safetensors")
     assert header.split == "test_l" and header.part == "tn34" and len(found) == len(header.scenes) == 3
     assert "AP" in smoke.outcomes["evaluate"].out
+
+
+def test_a_score_of_other_predictions_is_not_current(smoke, tmp_path, monkeypatch):
+    """As it is left where an evaluation ends between its two steps."""
+    monkeypatch.chdir(smoke.folder)
+    run = tmp_path / "run"
+    shutil.copytree(smoke.run, run)
+    evaluation, trained = Evaluation("test_l"), read_run(run)
+    assert is_current(evaluation, run, trained)
+    path = run / "evaluation" / "test_l" / "metrics.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "predictions": "0" * 16}))
+    assert not is_current(evaluation, run, trained)
 
 
 def test_the_report_is_one_page_that_loads_nothing(smoke):

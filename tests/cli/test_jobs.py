@@ -15,17 +15,8 @@ from omegaconf import OmegaConf, open_dict
 
 from pnet.cli.app import LONGEST_NAME, config_dir, hydra_value, short_name
 from pnet.cli.evaluate import Evaluation, recovery_settings, wanted_evaluations
-from pnet.cli.jobs import (
-    RunIndex,
-    cell_evaluation,
-    changed,
-    composed,
-    expand,
-    making,
-    plain_jobs,
-    read_metrics,
-    sweep_jobs,
-)
+from pnet.cli.jobs import cell_evaluation, changed, composed, expand, making, plain_jobs, sweep_jobs
+from pnet.cli.runs import RunIndex, read_metrics
 from pnet.cli.settings import training_settings
 from pnet.cli.sweep_file import CellPlan, Heading, TablePlan, read_sweep
 from pnet.scenes.manifest import settings_fingerprint
@@ -40,15 +31,7 @@ ICP = {
 }
 
 
-@pytest.fixture(autouse=True)
-def app(tmp_path, monkeypatch):
-    """As inside a command: composing works, and the working directory is empty."""
-    monkeypatch.chdir(tmp_path)
-    GlobalHydra.instance().clear()
-    outer = HydraConfig.instance().cfg
-    with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        yield
-    HydraConfig.instance().cfg = outer
+pytestmark = pytest.mark.usefixtures("hydra_app")
 
 
 def planned(sweep, *words):

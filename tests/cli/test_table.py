@@ -5,13 +5,11 @@ import shutil
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
+from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf, open_dict
 
-from pnet.cli.app import config_dir
-from pnet.cli.jobs import RunIndex
+from pnet.cli.runs import RunIndex
 from pnet.cli.sweep_file import Heading, TablePlan, read_sweep
 from pnet.cli.table import collect, sweep_name
 
@@ -33,15 +31,7 @@ PLAN = TablePlan(
 FULL, WITHOUT = "test_g", "test_g_radius_filter-None"
 
 
-@pytest.fixture(autouse=True)
-def app(tmp_path, monkeypatch):
-    """As inside a command: composing works, and the working directory is empty."""
-    monkeypatch.chdir(tmp_path)
-    GlobalHydra.instance().clear()
-    outer = HydraConfig.instance().cfg
-    with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        yield
-    HydraConfig.instance().cfg = outer
+pytestmark = pytest.mark.usefixtures("hydra_app")
 
 
 def resolved(*overrides):

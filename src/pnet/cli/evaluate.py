@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig, OmegaConf
 
 from pnet.cli.app import closest, key_paths, run_app, short_name
-from pnet.cli.settings import is_trained, read_run
+from pnet.cli.settings import METRICS, is_trained, read_run
 
 if TYPE_CHECKING:
     from pnet.data.scene_folder import SceneFolder
@@ -149,7 +149,11 @@ def _weights_digest(run: Path) -> str:
     weights = run / "checkpoints" / NAME
     if not weights.is_file():
         raise FileNotFoundError(f"{weights}: no checkpoint there; train first with pnet-train")
-    return sha256(weights.read_bytes()).hexdigest()[:16]
+    return _digest(weights)
+
+
+def _digest(path: Path) -> str:
+    return sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def _method_digest(trained: DictConfig) -> str:
@@ -161,11 +165,12 @@ def _method_digest(trained: DictConfig) -> str:
 def is_current(evaluation: Evaluation, run: Path, trained: DictConfig) -> bool:
     """Whether the run's weights were scored like this already, on the data that is there."""
     from pnet.engine.predictions import read_predictions
+    from pnet.engine.provenance import read_json
 
     folder = evaluation.folder(run)
-    if not (folder / "metrics.json").is_file():
-        return False
     try:
+        if read_json(folder / METRICS).get("predictions") != _digest(folder / PREDICTIONS):
+            return False  # scored before they were predicted anew
         scenes, data = open_scenes(evaluation, trained)
         header, _ = read_predictions(folder / PREDICTIONS)
         check_predictions(folder, header, expected_header(evaluation, run, trained, data), scenes)
@@ -183,8 +188,6 @@ def predict(evaluation: Evaluation, run: Path) -> None:
 
     trained = read_run(run)
     estimator = load_estimator(run, recovery_settings(evaluation, trained))
-    for name in ("metrics.json", "curve.json"):  # they are of other predictions
-        (evaluation.folder(run) / name).unlink(missing_ok=True)
     scenes, data = open_scenes(evaluation, trained)
     expected = expected_header(evaluation, run, trained, data)
     with count_progress(f"predicting {evaluation.name}", len(scenes), "scenes") as advance:
@@ -218,7 +221,7 @@ def score(evaluation: Evaluation, run: Path, trained: DictConfig) -> dict[str, A
     }
     columns = {"recall": curve.recall.tolist(), "precision": curve.precision.tolist()}
     write_json(path.with_name("curve.json"), columns)
-    write_json(path.with_name("metrics.json"), metrics)
+    write_json(path.with_name(METRICS), {**metrics, "predictions": _digest(path)})
     return metrics
 
 

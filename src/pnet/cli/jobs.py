@@ -1,6 +1,5 @@
 """What a sweep has to do: its cells as trainings, each of which is one run folder."""
 
-import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -8,7 +7,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import yaml  # type: ignore[import-untyped]
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -19,7 +17,8 @@ from pnet.cli.app import hydra_value, key_of
 from pnet.cli.data_set import data_overrides
 from pnet.cli.evaluate import Evaluation, wanted_evaluations
 from pnet.cli.generate import making_settings
-from pnet.cli.settings import DECIDE_NOTHING, METRICS, RESOLVED, training_settings
+from pnet.cli.runs import RunIndex, read_json_object, read_metrics, read_settings
+from pnet.cli.settings import DECIDE_NOTHING, training_settings
 from pnet.cli.sweep_file import CellPlan, TablePlan
 from pnet.scenes.manifest import MANIFEST, settings_fingerprint
 
@@ -201,7 +200,7 @@ def restricted(table: TablePlan, words: Sequence[str]) -> Iterator[tuple[CellPla
 
 
 def find_job(
-    overrides: tuple[str, ...], generate: tuple[str, ...] | None, known: list[Job], index: "RunIndex"
+    overrides: tuple[str, ...], generate: tuple[str, ...] | None, known: list[Job], index: RunIndex
 ) -> Job:
     """The job of a cell's overrides: one that is known, or a new one, put to the known.
 
@@ -289,69 +288,7 @@ def changed(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any] | None:
     return changes
 
 
-class RunIndex:
-    """The runs below a folder, by their settings.
-
-    Attributes:
-        postprocess: of each run.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.postprocess: dict[Path, dict[str, Any]] = {}
-        self.settings: dict[Path, dict[str, Any]] = {}
-        for path in sorted(folder.glob(f"*/{RESOLVED}")):
-            try:
-                content = yaml.load(path.read_text(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-                self.settings[path.parent] = training_settings(content)
-                self.postprocess[path.parent] = content["postprocess"]
-            except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError, AttributeError):
-                continue  # of another version, or damaged: not ours to judge
-
-    def find(self, settings: dict[str, Any]) -> Path | None:
-        """The run with these settings."""
-        return next(iter(self.matching(settings, any_seed=False)), None)
-
-    def matching(self, settings: dict[str, Any], any_seed: bool) -> list[Path]:
-        """The runs with these settings, whatever their seed or with this one; of equal ones the first that
-        has ended, else the first."""
-        free = {"seed": None} if any_seed else {}
-        equal = [run for run, own in self.settings.items() if {**own, **free} == {**settings, **free}]
-        found: dict[int, Path] = {}
-        for run in sorted(equal, key=lambda run: read_metrics(run) is None):
-            found.setdefault(self.settings[run]["seed"], run)
-        return list(found.values())
-
-
-def read_settings(run: Path) -> dict[str, Any] | None:
-    """What a run's training depended on; None where it is of another version, damaged or not there."""
-    try:
-        content = yaml.load(
-            (run / RESOLVED).read_text(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-        )
-        return training_settings(content)
-    except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError, AttributeError):
-        return None
-
-
 @lru_cache(maxsize=256)
 def making(overrides: tuple[str, ...]) -> dict[str, Any]:
     """The settings by which pnet-generate would make a data set."""
     return making_settings(compose("generate", overrides=list(overrides)))
-
-
-def read_json_object(path: Path) -> dict[str, Any] | None:
-    """A JSON file's object; None where it is not there or damaged."""
-    try:
-        content = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return None
-    return content if isinstance(content, dict) else None
-
-
-def read_metrics(run: Path) -> dict[str, Any] | None:
-    """A run's metrics.json with its `steps` and `evaluations`; None where it is not there or damaged."""
-    try:
-        content = json.loads((run / METRICS).read_text())
-        return {**content, "steps": int(content["steps"]), "evaluations": {**content.get("evaluations", {})}}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None

@@ -11,7 +11,8 @@ from hydra.plugins.launcher import Launcher
 from rich.console import Console
 
 from pnet.cli.app import EXPECTED, fail, key_of
-from pnet.cli.jobs import RUNS, Job, plain_jobs, read_metrics, sweep_jobs
+from pnet.cli.jobs import RUNS, Job, plain_jobs, sweep_jobs
+from pnet.cli.runs import read_metrics
 from pnet.cli.settings import recipe_text
 from pnet.cli.sweep_file import read_sweep
 

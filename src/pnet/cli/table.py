@@ -10,14 +10,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from pnet.cli.app import key_of, run_app, short_name
-from pnet.cli.jobs import (
-    RunIndex,
-    cell_evaluation,
-    composed,
-    read_json_object,
-    read_metrics,
-    restricted,
-)
+from pnet.cli.jobs import cell_evaluation, composed, restricted
+from pnet.cli.runs import RunIndex, read_json_object, read_metrics
 from pnet.cli.sweep_file import CellPlan, TablePlan, read_sweep
 from pnet.scenes.manifest import MANIFEST, settings_fingerprint
 

@@ -83,8 +83,9 @@ def metrics_table(metrics: Mapping[str, float | None]) -> Table:
     """The metrics that are given, in a fixed order; unknown ones last, under their own name.
 
     Args:
-        metrics: values by key of `METRICS`; None or NaN is shown as a dash.
+        metrics: values by key of `METRICS`; None or NaN is shown as a dash, what is no number is left out.
     """
+    metrics = {key: value for key, value in metrics.items() if not isinstance(value, str)}
     table = Table()
     table.add_column("metric", no_wrap=True)
     table.add_column("value", justify="right", no_wrap=True)
