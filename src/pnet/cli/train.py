@@ -90,12 +90,14 @@ def evaluation_entry(evaluation: Evaluation, run: Path, trained: DictConfig) -> 
     """What metrics.json keeps of an evaluation: how, on what and by which code, and its metrics."""
     from pnet.engine.provenance import commit_text, git_state, read_json
 
+    found = read_json(evaluation.folder(run) / METRICS)
+    found.pop("predictions", None)  # a digest of the file, times and all
     return {
         "split": evaluation.split,
         "postprocess": evaluation.postprocess,
         "data": open_scenes(evaluation, trained)[1],
         "commit": commit_text(git_state(Path(__file__).parent)),
-        **read_json(evaluation.folder(run) / METRICS),
+        **found,
     }
 
 
