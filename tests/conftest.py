@@ -12,15 +12,31 @@ from scipy.spatial.transform import Rotation
 
 from pnet.cli.instantiate import instantiate
 from pnet.geometry.camera import Camera
+from pnet.geometry.symmetry import SphericalSymmetry
 from pnet.parts.base import ParametricPart
+from pnet.parts.primitives import Sphere
+from pnet.parts.selection import Keypoint
+from pnet.parts.shapes import Ball
 from pnet.records import Scene, SceneId
 from pnet.scenes.factory import SceneFactory
 from pnet.scenes.pile import Bin
-from pnet.scenes.piling import Physics
+from pnet.scenes.bullet import BulletPhysics
 from pnet.scenes.protocol import Protocol, SplitPlan
 from pnet.scenes.store import CycleHeader, write_cycle
 
 CONF = Path(__file__).parents[1] / "conf"
+
+
+class Marble(ParametricPart):
+    """One keypoint, one parameter, every rotation a symmetry."""
+
+    name = "marble"
+    parameter_names = ("r",)
+    symmetry = SphericalSymmetry()
+    keypoints = (Keypoint("surface", "centroid", Sphere(), "r"),)
+
+    def solid(self, parameters):
+        return Ball(self.split(parameters)[0])
 
 
 def load_part(name: str) -> ParametricPart:
@@ -76,7 +92,7 @@ def factory(tn34: ParametricPart, camera: Camera, box: Bin) -> SceneFactory:
         protocol,
         camera,
         box,
-        Physics(),
+        BulletPhysics(),
         camera_height=0.65,
         clutter_spacing=0.6,
         seed=0,

@@ -49,6 +49,9 @@ class Scene:
         visibility: (d,) the paper's V = N_j / N_max over the image's pixels, in [0, 1].
         occlusion: (d,) 1 − visible share of the body's own unclipped silhouette, in [0, 1].
         camera: the view. part: the template's name. id: where it comes from.
+        incidence: (N,) uint8, 255 times the cosine of the angle between viewing ray and surface normal.
+        edge: (N,) uint8 pixels to the nearest jump of the depth image. Both are what `SensorNoise` needs;
+            None where nobody knows them.
     """
 
     points: NDArray[np.float32]
@@ -61,6 +64,8 @@ class Scene:
     camera: Camera
     part: str
     id: SceneId
+    incidence: NDArray[np.uint8] | None = None
+    edge: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,17 +6,13 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from tests.conftest import load_part
+from tests.conftest import Marble, load_part
 
 from pnet.data.augmentation import rotate_about_view_axis
 from pnet.data.targets import instance_keypoints, point_labels, pose_labels, pose_scale
 from pnet.geometry.camera import Camera
-from pnet.geometry.symmetry import FiniteSymmetry, RevolutionSymmetry, SphericalSymmetry
-from pnet.parts.base import ParametricPart
+from pnet.geometry.symmetry import FiniteSymmetry, RevolutionSymmetry
 from pnet.parts.choice import KeypointChoice, KeypointRule
-from pnet.parts.primitives import Sphere
-from pnet.parts.selection import Keypoint
-from pnet.parts.shapes import Ball
 from pnet.parts.tn16 import TN16
 from pnet.parts.tn42 import TN42
 from pnet.records import Scene, SceneId
@@ -207,18 +203,6 @@ def test_point_labels_of_sixty_bodies_are_those_of_trying_every_place(pile):
             chosen[name] = places[np.argmin(distance)]
             step = 2e-3 * scene.parameters[i].max() if len(places) == len(CIRCLE) else 1e-6
             assert np.linalg.norm(scene.R[i] @ chosen[name] + scene.t[i] - found) < step, (n, name)
-
-
-class Marble(ParametricPart):
-    """Every rotation is a symmetry."""
-
-    name = "marble"
-    parameter_names = ("r",)
-    symmetry = SphericalSymmetry()
-    keypoints = (Keypoint("surface", "centroid", Sphere(), "r"),)
-
-    def solid(self, parameters):
-        return Ball(self.split(parameters)[0])
 
 
 def rotations(n: int, seed: int) -> torch.Tensor:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from scipy.spatial.transform import Rotation
-from tests.conftest import CONF, load_part
+from tests.conftest import CONF, Marble, load_part
 
 from pnet.cli.instantiate import instantiate
 from pnet.data.dataset import collate
@@ -24,23 +24,10 @@ from pnet.geometry.symmetry import (
 from pnet.models.pose_loss import PoseLoss, RotationNorm
 from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointChoice
-from pnet.parts.primitives import Plane, Sphere
+from pnet.parts.primitives import Plane
 from pnet.parts.selection import Keypoint
-from pnet.parts.shapes import Ball
 from pnet.parts.solids import box
 from pnet.records import Batch, PosePrediction
-
-
-class Marble(ParametricPart):
-    """Every rotation is a symmetry."""
-
-    name = "marble"
-    parameter_names = ("r",)
-    symmetry = SphericalSymmetry()
-    keypoints = (Keypoint("surface", "centroid", Sphere(), "r"),)
-
-    def solid(self, parameters):
-        return Ball(self.split(parameters)[0])
 
 
 class Brick(ParametricPart):

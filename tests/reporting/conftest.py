@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tests.conftest import Marble
 
 from pnet.geometry.camera import Camera
-from pnet.geometry.symmetry import RevolutionSymmetry, SphericalSymmetry
+from pnet.geometry.symmetry import RevolutionSymmetry
 from pnet.parts.base import ParametricPart
-from pnet.parts.primitives import Plane, Sphere
+from pnet.parts.primitives import Plane
 from pnet.parts.selection import Keypoint
-from pnet.parts.shapes import Ball
 from pnet.parts.solids import cylinder
 from pnet.parts.tn34 import TN34
 from pnet.parts.tn42 import TN42
@@ -20,18 +20,6 @@ from pnet.records import Detections, Scene, SceneId
 
 R, H = 0.018, 0.016
 POINTS_PER_BODY = 200
-
-
-class Marble(ParametricPart):
-    """One keypoint, one parameter, every rotation a symmetry."""
-
-    name = "marble"
-    parameter_names = ("r",)
-    symmetry = SphericalSymmetry()
-    keypoints = (Keypoint("surface", "centroid", Sphere(), "r"),)
-
-    def solid(self, parameters):
-        return Ball(self.split(parameters)[0])
 
 
 class Disc(ParametricPart):

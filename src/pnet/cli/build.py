@@ -137,17 +137,17 @@ def use_bf16(precision: str, accelerator: str) -> bool:
     return bool(torch.cpu._is_avx512_bf16_supported())
 
 
-def load_estimator(run: Path, recovery: DictConfig | None = None) -> "Estimator":
+def load_estimator(run: Path, recovery: DictConfig) -> "Estimator":
     """The estimator of a run folder.
 
     Args:
-        run: made by pnet-train. recovery: settings of post-processing instead of the run's own.
+        run: made by pnet-train. recovery: settings of a network's post-processing.
     """
     cfg = read_run(run)
     if not is_trained(cfg):
         estimator: Estimator = instantiate(cfg.method.estimator, part=instantiate(cfg.part))
         return estimator
-    return load_network(run, cfg, recovery if recovery is not None else cfg.postprocess)
+    return load_network(run, cfg, recovery)
 
 
 def load_network(run: Path, cfg: DictConfig, recovery: DictConfig) -> "NetworkEstimator":

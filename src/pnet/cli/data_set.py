@@ -43,7 +43,7 @@ def repeated(cfg: DictConfig) -> DictConfig:
 def make_data_again(cfg: DictConfig) -> None:
     """Have the data of the run `repeat` made where it is gone; other data in its place is an error."""
     from pnet.scenes.manifest import MANIFEST, read_manifest
-    from pnet.scenes.store import SUFFIX
+    from pnet.scenes.record_file import SUFFIX
 
     root, wanted = Path(cfg.data.root), read_manifest(Path(cfg.repeat))
     if (root / MANIFEST).exists() and read_manifest(root) != wanted:

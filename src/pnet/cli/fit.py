@@ -93,7 +93,7 @@ def begin_run(cfg: DictConfig, run: Path) -> None:
     """Write what the run is made of; metrics.json of an earlier one goes."""
     from pnet.engine.provenance import commit_text, provenance, write_json
     from pnet.scenes.manifest import MANIFEST, read_manifest
-    from pnet.scenes.store import write_atomically
+    from pnet.scenes.record_file import write_atomically
 
     data = read_manifest(Path(cfg.data.root))
     run.mkdir(parents=True, exist_ok=True)

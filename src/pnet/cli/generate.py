@@ -3,6 +3,7 @@
 import json
 import os
 from collections import Counter
+from contextlib import nullcontext
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -13,12 +14,12 @@ from pnet.cli.app import run_app
 
 if TYPE_CHECKING:
     from pnet.parts.base import ParametricPart
-    from pnet.scenes.factory import SceneFactory
-    from pnet.scenes.generation import Summary
+    from pnet.scenes.generation import Plan, Summary
     from pnet.scenes.protocol import CycleTask, Protocol
 
-# what decides a scene's bytes; the rest (workers, folders) does not
-MAKING = ("part", "protocol", "camera", "bin", "physics", "seed", "camera_height", "clutter_spacing")
+# what decides a pile's and a scene's bytes; the rest (workers, folders) does not
+PILING = ("part", "protocol", "bin", "physics", "clutter", "seed")
+MAKING = (*PILING, "camera", "view", "noise", "noise_in")
 
 
 def main() -> None:
@@ -32,14 +33,15 @@ def generate_data(cfg: DictConfig) -> None:
 
     if cfg.like is not None:
         cfg = like(cfg)
-    settings = making_settings(cfg)
-    factory = build_factory(cfg, settings)
-    tasks = plan_tasks(
-        factory.part, factory.protocol
-    )  # may refuse the settings, so before anything is written
-    root = Path(cfg.data.root)
-    with hold(root, f"another process makes {root}"):
-        make_missing(cfg, factory, manifest_of(settings, tasks), tasks, root)
+    plan = build_plan(cfg)
+    piles = plan.factory.piles
+    tasks = plan_tasks(piles.part, piles.protocol)  # may refuse the settings, so before anything is written
+    mine = take_share(tasks, cfg.shard)
+    busy = plan.piles if plan.stage == "simulate" else plan.scenes
+    # shares of other machines meet on a shared disk, where locks cannot be trusted; files come by renaming
+    with hold(busy, f"another process makes {busy}") if cfg.shard is None else nullcontext():
+        open_folders(cfg, plan, tasks)
+        make_missing(cfg, plan, mine)
 
 
 def like(cfg: DictConfig) -> DictConfig:
@@ -51,29 +53,49 @@ def like(cfg: DictConfig) -> DictConfig:
         made = {key: json.loads(path.read_text())[key] for key in MAKING}
     except (ValueError, KeyError, TypeError) as fault:
         raise ValueError(f"{path}: not a data set's manifest ({fault})") from fault
-    rest = {key: cfg[key] for key in ("data", "workers")}
+    rest = {key: cfg[key] for key in ("data", "workers", "stage", "shard")}
     return OmegaConf.create({**made, **rest})
 
 
-def make_missing(
-    cfg: DictConfig, factory: "SceneFactory", manifest: dict[str, Any], tasks: list["CycleTask"], root: Path
-) -> None:
+def take_share(tasks: list["CycleTask"], shard: str | None) -> list["CycleTask"]:
+    """Every n-th task, from the k-th on, for shard="k/n"; all for None."""
+    if shard is None:
+        return tasks
+    first, _, count = str(shard).partition("/")
+    if not (first.isdigit() and count.isdigit() and 1 <= int(first) <= int(count)):
+        raise ValueError(f"shard={shard}: expected a number and a count, from 1/8 to 8/8 for eight shares")
+    return tasks[int(first) - 1 :: int(count)]
+
+
+def open_folders(cfg: DictConfig, plan: "Plan", tasks: list["CycleTask"]) -> None:
+    """Create the folders of the stages with their manifests, or check the manifests that are there."""
+    from pnet.scenes.generation import open_root
+    from pnet.scenes.manifest import read_manifest
+
+    piles = manifest_of(piling_settings(making_settings(cfg)), tasks)
+    if plan.stage == "render":
+        read_manifest(plan.piles, "run pnet-generate stage=simulate first, or name another data.piles")
+    open_root(plan.piles, piles, "data.piles")
+    if plan.stage != "simulate":
+        open_root(plan.scenes, manifest_of(making_settings(cfg), tasks))
+
+
+def make_missing(cfg: DictConfig, plan: "Plan", tasks: list["CycleTask"]) -> None:
     """Make the files that are not there, with a progress bar and a summary."""
     from pnet.reporting.progress import scene_progress
-    from pnet.scenes.generation import Summary, generate, open_root
+    from pnet.scenes.generation import Summary, generate
 
-    open_root(root, manifest)
     workers = os.cpu_count() or 1 if cfg.workers is None else cfg.workers
     summary, start = Summary(), perf_counter()
-    with scene_progress(len(tasks), len(factory.protocol.scene_drops())) as advance:
-        for report in generate(factory, root, tasks, workers):
+    with scene_progress(len(tasks), len(plan.factory.piles.protocol.scene_drops())) as advance:
+        for report in generate(plan, tasks, workers):
             if report is None:
                 summary.kept += 1
             else:
                 summary.add(report)
             advance(report is not None)
     summary.seconds = perf_counter() - start
-    print_summary(root, summary)
+    print_summary(plan, summary)
 
 
 def plan_tasks(part: "ParametricPart", protocol: "Protocol") -> list["CycleTask"]:
@@ -110,37 +132,59 @@ def making_settings(cfg: DictConfig) -> dict[str, Any]:
     return {str(key): value for key, value in settings.items()}
 
 
-def build_factory(cfg: DictConfig, settings: dict[str, Any]) -> "SceneFactory":
-    """Everything that scenes are made from, out of the config."""
+def piling_settings(settings: dict[str, Any]) -> dict[str, Any]:
+    """Of the settings those that decide what the piles are."""
+    kept = {key: settings[key] for key in PILING}
+    protocol = {key: value for key, value in kept["protocol"].items() if key not in ("name", "points")}
+    return {**kept, "protocol": protocol}
+
+
+def build_plan(cfg: DictConfig) -> "Plan":
+    """What to make where, out of the config."""
     from pnet.cli.instantiate import instantiate
     from pnet.scenes.factory import SceneFactory
+    from pnet.scenes.generation import Plan
     from pnet.scenes.manifest import settings_fingerprint
+    from pnet.scenes.pile_factory import PileFactory
+    from pnet.scenes.protocol import SPLITS
+    from pnet.scenes.view_factory import ViewFactory
 
-    return SceneFactory(
-        part=instantiate(cfg.part),
-        protocol=instantiate(cfg.protocol),
-        camera=instantiate(cfg.camera),
+    for split in cfg.noise_in:
+        if split not in SPLITS:
+            raise ValueError(f"noise_in holds {split!r}, choose from {', '.join(SPLITS)}")
+    settings = making_settings(cfg)
+    part, protocol = instantiate(cfg.part), instantiate(cfg.protocol)
+    piles = PileFactory(
+        part=part,
+        protocol=protocol,
         box=instantiate(cfg.bin),
         physics=instantiate(cfg.physics),
-        camera_height=cfg.camera_height,
-        clutter_spacing=cfg.clutter_spacing,
+        clutter=instantiate(cfg.clutter),
         seed=cfg.seed,
-        fingerprint=settings_fingerprint(settings),
+        fingerprint=settings_fingerprint(piling_settings(settings)),
     )
+    views = ViewFactory(
+        part, instantiate(cfg.camera), instantiate(cfg.view), instantiate(cfg.noise), protocol.points
+    )
+    factory = SceneFactory(piles, views, settings_fingerprint(settings), tuple(cfg.noise_in))
+    return Plan(factory, Path(cfg.data.piles), Path(cfg.data.root), cfg.stage)
 
 
-def print_summary(root: Path, summary: "Summary") -> None:
+def print_summary(plan: "Plan", summary: "Summary") -> None:
     """What was made, how fast, and what went wrong with it."""
     from rich.console import Console
 
     out = Console(soft_wrap=True)
-    out.print(f"{summary.made} cycles made, {summary.kept} were there; data set in {root}")
+    what, where = ("piles", plan.piles) if plan.stage == "simulate" else ("data set", plan.scenes)
+    out.print(f"{summary.made} cycles made, {summary.kept} were there; {what} in {where}")
     if not summary.scenes:
         return
+    if summary.simulated < summary.made and plan.stage == "all":
+        out.print(f"the piles of {summary.made - summary.simulated} of these cycles were there")
     rate = summary.scenes / summary.seconds
     out.print(f"{summary.scenes} scenes in {summary.seconds:.1f} s: {rate:.1f} scenes/s")
     stages = vars(summary.times).items()
-    times = ", ".join(f"{name} {1000 * s / summary.scenes:.0f}" for name, s in stages)
+    times = ", ".join(f"{name} {1000 * s / summary.scenes:.1f}" for name, s in stages if s)
     out.print(f"milliseconds a scene and worker: {times}")
     out.print(
         f"{summary.escaped} bodies left the bin and were removed, {summary.unsettled} scenes were not "

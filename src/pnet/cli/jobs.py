@@ -17,7 +17,7 @@ from pnet.cli.app import hydra_value, key_of
 from pnet.cli.data_set import data_overrides
 from pnet.cli.evaluate import Evaluation, wanted_evaluations
 from pnet.cli.generate import making_settings
-from pnet.cli.runs import RunIndex, read_json_object, read_metrics, read_settings
+from pnet.cli.runs import RunIndex, read_json_object, read_metrics, read_resolved
 from pnet.cli.settings import DECIDE_NOTHING, training_settings
 from pnet.cli.sweep_file import CellPlan, TablePlan
 from pnet.scenes.manifest import MANIFEST, settings_fingerprint
@@ -30,7 +30,7 @@ class Job:
     """One training, and the evaluations that cells need of it.
 
     Attributes:
-        overrides: of pnet-train, only those that decide something. run: its folder.
+        overrides: of pnet-train. run: its folder.
         settings: all that the training depends on. postprocess: of the run. steps: of the training.
         evaluations: by name. generate: overrides of pnet-generate; None where data is not made.
         cells: which cells it serves.
@@ -62,7 +62,8 @@ class Job:
 
     def _is_own(self) -> bool:
         """Whether the folder's run has this job's settings, and was trained on the data that is asked for."""
-        if read_settings(self.run) != self.settings:
+        found = read_resolved(self.run)
+        if found is None or found[0] != self.settings:
             return False
         made = read_json_object(self.run / MANIFEST)
         there = read_json_object(Path(self.settings["data"]["root"]) / MANIFEST)

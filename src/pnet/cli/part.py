@@ -82,7 +82,7 @@ def part_checks(part: "ParametricPart", samples: int) -> Iterator["Check"]:
 
 def write_mesh(mesh: Any, path: Path) -> None:
     """Export in the format that the ending names; the file appears when it is whole."""
-    from pnet.scenes.store import write_atomically
+    from pnet.scenes.record_file import write_atomically
 
     content = mesh.export(file_type=path.suffix.removeprefix("."))
     write_atomically(path, content.encode() if isinstance(content, str) else content)

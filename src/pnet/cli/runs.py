@@ -8,24 +8,23 @@ import yaml  # type: ignore[import-untyped]
 
 from pnet.cli.settings import METRICS, RESOLVED, training_settings
 
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # in C where it was built so: a sweep reads many
+
 
 class RunIndex:
-    """The runs below a folder, by their settings.
+    """The runs below a folder, by their settings; those of another version, or damaged, are left out.
 
     Attributes:
-        postprocess: of each run.
+        settings: what the training of each run depended on. postprocess: of each run.
     """
 
     def __init__(self, folder: Path) -> None:
         self.postprocess: dict[Path, dict[str, Any]] = {}
         self.settings: dict[Path, dict[str, Any]] = {}
         for path in sorted(folder.glob(f"*/{RESOLVED}")):
-            try:
-                content = yaml.load(path.read_text(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-                self.settings[path.parent] = training_settings(content)
-                self.postprocess[path.parent] = content["postprocess"]
-            except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError, AttributeError):
-                continue  # of another version, or damaged: not ours to judge
+            found = read_resolved(path.parent)
+            if found is not None:
+                self.settings[path.parent], self.postprocess[path.parent] = found
 
     def find(self, settings: dict[str, Any]) -> Path | None:
         """The run with these settings."""
@@ -42,13 +41,12 @@ class RunIndex:
         return list(found.values())
 
 
-def read_settings(run: Path) -> dict[str, Any] | None:
-    """What a run's training depended on; None where it is of another version, damaged or not there."""
+def read_resolved(run: Path) -> tuple[dict[str, Any], dict[str, Any]] | None:
+    """What a run's training depended on, and its post-processing; None where there is no whole one of this
+    version."""
     try:
-        content = yaml.load(
-            (run / RESOLVED).read_text(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-        )
-        return training_settings(content)
+        content = yaml.load((run / RESOLVED).read_text(), LOADER)
+        return training_settings(content), content["postprocess"]
     except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError, AttributeError):
         return None
 
@@ -64,8 +62,8 @@ def read_json_object(path: Path) -> dict[str, Any] | None:
 
 def read_metrics(run: Path) -> dict[str, Any] | None:
     """A run's metrics.json with its `steps` and `evaluations`; None where it is not there or damaged."""
+    content = read_json_object(run / METRICS) or {}
     try:
-        content = json.loads((run / METRICS).read_text())
         return {**content, "steps": int(content["steps"]), "evaluations": {**content.get("evaluations", {})}}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError):
         return None

@@ -33,13 +33,14 @@ def sweep(arguments: Sequence[str], launcher: Launcher) -> list[JobReturn]:
         dry = any(asked(arguments, DRY_RUN))
     except EXPECTED as fault:  # Hydra would print a traceback
         fail(fault)
-    missing = [job for job in jobs if job.missing()]
+    states = [(job, job.missing()) for job in jobs]
+    missing = [job for job, state in states if state]
+    to_train = [job for job, state in states if "training" in state]
     out = Console(soft_wrap=True)
     if dry:
-        out.print(f"runs in {RUNS}:", *job_lines(jobs), sep="\n", markup=False, highlight=False)
-    out.print(
-        f"{len(jobs)} jobs: {len(jobs) - len(missing)} done, {len(missing)} missing; {estimate(missing)}"
-    )
+        out.print(f"runs in {RUNS}:", *job_lines(states), sep="\n", markup=False, highlight=False)
+    left = estimate(to_train) if missing else "nothing to do"
+    out.print(f"{len(jobs)} jobs: {len(jobs) - len(missing)} done, {len(missing)} missing; {left}")
     if dry or not missing:
         return []
     reasons, returns = launch(missing, launcher)
@@ -88,17 +89,17 @@ def launch(jobs: Sequence[Job], launcher: Launcher) -> tuple[dict[int, str], lis
     return {i: " ".join(str(found._return_value).split()) for i, found in failed}, returns
 
 
-def job_lines(jobs: Sequence[Job]) -> Iterator[str]:
+def job_lines(states: Sequence[tuple[Job, list[str]]]) -> Iterator[str]:
     """Every job with the tables that it serves and what is missing of it."""
-    width = max(len(job.run.name) for job in jobs)
-    for job in jobs:
+    width = max(len(job.run.name) for job, _ in states)
+    for job, missing in states:
         serves = ", ".join(dict.fromkeys(name.split(":")[0] for name in job.cells))
-        missing = ", ".join(job.missing()) or "done"
-        yield f"{job.run.name:<{width}}  {serves + ': ' if serves else ''}{missing}"
+        state = ", ".join(missing) or "done"
+        yield f"{job.run.name:<{width}}  {serves + ': ' if serves else ''}{state}"
 
 
-def estimate(missing: Sequence[Job]) -> str:
-    """How long the missing trainings will take, by the runs of their protocol that have ended."""
+def estimate(to_train: Sequence[Job]) -> str:
+    """How long the missing trainings will take, by the runs of their kind that have ended."""
     from pnet.reporting.paper_table import duration_text
 
     known: dict[str, list[float]] = {}
@@ -108,11 +109,9 @@ def estimate(missing: Sequence[Job]) -> str:
         if name and seconds and steps:
             known.setdefault(str(name), []).append(float(seconds) / int(steps))
     total = 0.0
-    for job in missing:
-        if "training" not in job.missing():
-            continue
+    for job in to_train:
         pace = known.get(recipe_text(job.settings))
         if pace is None:
             return "no run of this kind has ended yet, so no estimate of the time"
         total += median(pace) * job.steps
-    return f"about {duration_text(total)} of training" if missing else "nothing to do"
+    return f"about {duration_text(total)} of training"

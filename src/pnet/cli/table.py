@@ -32,7 +32,7 @@ def table(cfg: DictConfig) -> None:
 
     from pnet.reporting.paper_chart import chart
     from pnet.reporting.paper_table import csv_text, latex, markdown, rich_table
-    from pnet.scenes.store import write_atomically
+    from pnet.scenes.record_file import write_atomically
 
     words = [word for word in HydraConfig.get().overrides.task if key_of(word) not in OWN]
     out, folder = Console(soft_wrap=True), Path(cfg.output)

@@ -37,15 +37,12 @@ def train(cfg: DictConfig) -> None:
             make_data_again(cfg)
         elif cfg.data.generate is not None:
             make_data(cfg)
-        metrics = fit(cfg, run) if is_trained(cfg) else without_training(cfg, run)
-        if all(is_evaluated(metrics, evaluation, run) for evaluation in evaluations):
-            if not (run / METRICS).is_file():
-                finish(cfg, run, metrics)
-        else:
-            metrics, failed = evaluate_all(metrics, evaluations, run)
+        trained = fit(cfg, run) if is_trained(cfg) else without_training(cfg, run)
+        metrics, failed = evaluate_all(trained, evaluations, run)
+        if metrics != trained or not (run / METRICS).is_file():
             finish(cfg, run, metrics)
-            if failed:
-                raise ValueError("; ".join(failed))
+        if failed:
+            raise ValueError("; ".join(failed))
         print_end(run, read_json(run / METRICS))
 
 
@@ -57,11 +54,6 @@ def without_training(cfg: DictConfig, run: Path) -> dict[str, Any]:
         return read_json(run / METRICS)
     begin_run(cfg, run)
     return {"steps": 0, "training_seconds": 0.0, "scenes_per_second": None, "validation": {}}
-
-
-def is_evaluated(metrics: dict[str, Any], evaluation: Evaluation, run: Path) -> bool:
-    """Whether a run's metrics hold this evaluation of its weights."""
-    return evaluation.name in metrics.get("evaluations", {}) and is_current(evaluation, run, read_run(run))
 
 
 def evaluate_all(

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from pnet.records import Scene, SceneId
 from pnet.scenes.manifest import MANIFEST, read_manifest
-from pnet.scenes.store import SUFFIX, CycleFile
+from pnet.scenes.record_file import SUFFIX
+from pnet.scenes.store import CycleFile
 
 
 class SceneFolder(Sequence[Scene]):

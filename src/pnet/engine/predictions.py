@@ -11,7 +11,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from pnet.records import Detections
-from pnet.scenes.store import write_atomically
+from pnet.scenes.record_file import write_atomically
 
 FORMAT = "pnet-predictions"
 VERSION = 1

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from pnet.scenes.store import write_atomically
+from pnet.scenes.record_file import write_atomically
 
 PACKAGES = (
     "pnet",

@@ -21,7 +21,7 @@ from pnet.geometry.symmetry import (
     SphericalSymmetry,
     Symmetry,
 )
-from pnet.scenes.store import write_atomically
+from pnet.scenes.record_file import write_atomically
 
 ROTATION_TOLERANCE = 1e-3
 _FINITE, _REVOLUTION, _SPHERE = "AffinePoseUtils", "RevolutionPoseUtils", "SphericalPoseUtils"

@@ -10,7 +10,7 @@ import plotly.graph_objects as go
 import plotly.io
 from plotly.offline import get_plotlyjs
 
-from pnet.scenes.store import write_atomically
+from pnet.scenes.record_file import write_atomically
 
 Row = tuple[str, str, str]
 

@@ -24,7 +24,7 @@ from pnet.reporting.scene_view import (
     instance_colours,
     point_colours,
 )
-from pnet.scenes.store import write_atomically
+from pnet.scenes.record_file import write_atomically
 
 Points = NDArray[np.float64]
 

@@ -3,41 +3,65 @@
 Piles rarely show a flat part standing on its rim; clutter shows every orientation equally often.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pnet.parts.base import ParametricPart
+from pnet.scenes.overlap import ConvexPiece, penetration
 from pnet.scenes.pile import Bin, Pile, Points
 
 ATTEMPTS = 30  # tries to place one body before it is left out
 
 
-def scatter_bodies(
-    part: ParametricPart,
-    parameters: Points,
-    box: Bin,
-    count: int,
-    spacing: float,
-    rng: np.random.Generator,
-) -> Pile:
-    """Scatter bodies in the lower part of the bin.
+@dataclass(frozen=True)
+class Clutter:
+    """How bodies are scattered.
 
-    Args:
-        part, parameters: the part object, (k,) metres. count: how many bodies to place.
+    Attributes:
         spacing: smallest distance of two centroids as a share of the part's bounding sphere's diameter.
-    Returns:
-        A `Pile` of at most `count` bodies; one that finds no room is left out.
+        density: bodies per volume, against layers of bounding spheres side by side; 2 fills half the depth.
+        overlap: whether bodies may reach into each other; False tests their convex pieces exactly (holes
+            filled), which takes longer and leaves more bodies out.
     """
-    radius = float(np.linalg.norm(part.mesh(parameters).vertices, axis=1).max())
-    half = np.maximum(np.array([box.width, box.depth]) / 2 - radius, 0)
-    # as deep as a pile of as many bodies would be
-    depth = min(box.height, 2 * radius * (1 + count * (2 * radius) ** 2 / (box.width * box.depth)))
-    placed = np.zeros((0, 3))
-    for _ in range(count):
+
+    spacing: float = 0.8
+    density: float = 1.0
+    overlap: bool = True
+
+    def __post_init__(self) -> None:
+        if self.spacing < 0:
+            raise ValueError(f"clutter.spacing is {self.spacing}, expected at least 0")
+        if self.density <= 0:
+            raise ValueError(f"clutter.density is {self.density}, expected more than 0")
+
+    def scatter(
+        self, part: ParametricPart, parameters: Points, box: Bin, count: int, rng: np.random.Generator
+    ) -> Pile:
+        """Scatter bodies in the lower part of the bin.
+
+        Args:
+            part, parameters: the part object, (k,) metres. count: how many bodies to place.
+        Returns:
+            A `Pile` of at most `count` bodies; one that finds no room is left out.
+        """
+        radius = float(np.linalg.norm(part.mesh(parameters).vertices, axis=1).max())
+        half = np.maximum(np.array([box.width, box.depth]) / 2 - radius, 0)
+        layers = count * (2 * radius) ** 2 / (box.width * box.depth * self.density)
+        depth = min(box.height, 2 * radius * (1 + layers))
         low, high = np.array([*-half, radius]), np.array([*half, max(depth, 2 * radius)])
-        candidates = rng.uniform(low, high, (ATTEMPTS, 3))
-        gap = np.linalg.norm(candidates[:, None] - placed[None], axis=-1).min(1, initial=np.inf)
-        fits = np.flatnonzero(gap >= 2 * radius * spacing)
-        if len(fits):
-            placed = np.concatenate([placed, candidates[fits[:1]]])
-    return Pile(Rotation.random(len(placed), rng=rng).as_matrix(), placed, drop=count)
+        pieces = [] if self.overlap else [ConvexPiece(p) for p in part.convex_pieces(parameters, True)]
+        turns, placed = np.zeros((0, 3, 3)), np.zeros((0, 3))
+        for _ in range(count):
+            candidates, turn = rng.uniform(low, high, (ATTEMPTS, 3)), Rotation.random(rng=rng).as_matrix()
+            for place in candidates:
+                gap = np.linalg.norm(placed - place, axis=1)
+                if gap.min(initial=np.inf) < 2 * radius * self.spacing:
+                    continue
+                near = gap < 2 * radius
+                others = list(zip(turns[near], placed[near], strict=True))
+                if self.overlap or penetration(pieces, turn, place, others) <= 0:
+                    turns, placed = np.concatenate([turns, turn[None]]), np.concatenate([placed, place[None]])
+                    break
+        return Pile(turns, placed, drop=count)

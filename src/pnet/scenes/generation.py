@@ -1,11 +1,15 @@
-"""Make a data set: many cycles in parallel, resumable at any moment."""
+"""Make a data set: many cycles in parallel, in two stages, resumable at any moment.
+
+Piles lie in a folder of their own: `simulate` makes them, `render` makes scenes of those that are there,
+`all` does both, cycle by cycle.
+"""
 
 import json
 import os
 import signal
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
-from dataclasses import astuple, dataclass, field
+from dataclasses import asdict, dataclass, field
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from threading import Thread
@@ -14,19 +18,29 @@ from typing import Any
 
 from pnet.scenes.factory import SceneFactory, StageTimes
 from pnet.scenes.manifest import MANIFEST, differences, read_manifest
+from pnet.scenes.pile_store import PileFile, write_piles
 from pnet.scenes.protocol import CycleTask
-from pnet.scenes.store import SUFFIX, TEMPORARY, CycleFile, write_atomically, write_cycle
+from pnet.scenes.record_file import SUFFIX, remove_left_overs, write_atomically
+from pnet.scenes.store import CycleFile, write_cycle
+
+STAGES = ("simulate", "render", "all")
 
 
 @dataclass(frozen=True)
 class CycleReport:
-    """What became of one task."""
+    """What became of one task.
+
+    Attributes:
+        scenes: made (piles, where only those are). escaped, unsettled, empty: see `CycleHeader`.
+        simulated: whether piles were made. times: seconds by stage.
+    """
 
     task: CycleTask
     scenes: int
     escaped: int
     unsettled: int
     empty: int
+    simulated: bool
     times: StageTimes
 
 
@@ -36,6 +50,7 @@ class Summary:
 
     Attributes:
         made, kept: cycles made now and found whole. scenes, escaped, unsettled, empty: of those made now.
+        simulated: cycles whose piles were made now.
         times: seconds by stage, summed over workers. seconds: wall time.
     """
 
@@ -45,29 +60,83 @@ class Summary:
     escaped: int = 0
     unsettled: int = 0
     empty: int = 0
+    simulated: int = 0
     times: StageTimes = field(default_factory=StageTimes)
     seconds: float = 0.0
 
     def add(self, report: CycleReport) -> None:
         """Count one finished cycle."""
         self.made += 1
-        self.scenes += report.scenes
-        self.escaped += report.escaped
-        self.unsettled += report.unsettled
-        self.empty += report.empty
-        self.times = StageTimes(
-            *(a + b for a, b in zip(astuple(self.times), astuple(report.times), strict=True))
-        )
+        for name in ("scenes", "escaped", "unsettled", "empty", "simulated"):
+            setattr(self, name, getattr(self, name) + getattr(report, name))
+        mine, more = asdict(self.times), asdict(report.times)
+        self.times = StageTimes(**{stage: mine[stage] + more[stage] for stage in mine})
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What to make where.
+
+    Attributes:
+        factory: what scenes are made from. piles, scenes: opened folders of the two stages.
+        stage: "simulate", "render" or "all".
+    """
+
+    factory: SceneFactory
+    piles: Path
+    scenes: Path
+    stage: str = "all"
+
+    def __post_init__(self) -> None:
+        if self.stage not in STAGES:
+            raise ValueError(f"stage={self.stage}: choose {', '.join(STAGES)}")
+
+    def is_done(self, task: CycleTask) -> bool:
+        """Whether the task's file is there, whole and of these settings."""
+        if self.stage == "simulate":
+            return self._has_piles(task)
+        path = cycle_path(self.scenes, task)
+        return path.exists() and _made_by(CycleFile, path) == self.factory.fingerprint
+
+    def make(self, task: CycleTask) -> CycleReport:
+        """Make what is missing of one task's files."""
+        times, path = StageTimes(), cycle_path(self.piles, task)
+        missing = self.stage != "render" and not self._has_piles(task)
+        if missing:
+            start = perf_counter()
+            made = self.factory.piles.make_piles(task)
+            simulated = perf_counter()
+            write_piles(path, *made)
+            times.simulate, times.write = simulated - start, perf_counter() - simulated
+        file = PileFile(path)
+        piles = [file.pile(i) for i in range(len(file))]  # as they are read: so stages agree to the bit
+        if self.stage == "simulate":
+            unsettled = sum(not pile.settled for pile in piles)
+            return CycleReport(task, len(piles), piles[-1].escaped, unsettled, 0, missing, times)
+        cycle = self.factory.render_cycle(task, file.header, piles)
+        start = perf_counter()
+        write_cycle(cycle_path(self.scenes, task), cycle.header, cycle.scenes)
+        times.write += perf_counter() - start
+        times.render, times.sample = cycle.times.render, cycle.times.sample
+        header = cycle.header
+        counts = (len(cycle.scenes), header.escaped, header.unsettled, header.empty)
+        return CycleReport(task, *counts, missing, times)
+
+    def _has_piles(self, task: CycleTask) -> bool:
+        path = cycle_path(self.piles, task)
+        return path.exists() and _made_by(PileFile, path) == self.factory.piles.fingerprint
 
 
 def cycle_path(root: Path, task: CycleTask) -> Path:
-    """Where a task's file lies."""
+    """Where a task's file lies, of scenes or of piles."""
     return root / task.split / (task.scene_id(0).file_stem + SUFFIX)
 
 
-def open_root(root: Path, settings: Mapping[str, Any]) -> None:
-    """Create the data folder and its manifest, or check that the one there was made with these settings.
+def open_root(root: Path, settings: Mapping[str, Any], key: str = "data.root") -> None:
+    """Create a data folder and its manifest, or check that the one there was made with these settings.
 
+    Args:
+        key: the setting that names the folder, for messages.
     Raises:
         ValueError: where other settings made it; names the first few that differ.
     """
@@ -78,46 +147,41 @@ def open_root(root: Path, settings: Mapping[str, Any]) -> None:
         if differing:
             raise ValueError(
                 f"{manifest}: this data was made with other settings: {'; '.join(differing[:4])}. "
-                "Choose another data.root, or delete this folder to make it anew"
+                f"Choose another {key}, or delete this folder to make it anew"
             )
     else:
         root.mkdir(parents=True, exist_ok=True)
         write_atomically(manifest, (json.dumps(settings, indent=1, sort_keys=True) + "\n").encode())
-    for left_over in root.rglob(f".*{TEMPORARY}"):
-        if not _is_running(left_over):
-            left_over.unlink(missing_ok=True)
+    remove_left_overs(root)
 
 
-def generate(
-    factory: SceneFactory, root: Path, tasks: Iterable[CycleTask], workers: int
-) -> Iterator[CycleReport | None]:
+def generate(plan: Plan, tasks: Iterable[CycleTask], workers: int) -> Iterator[CycleReport | None]:
     """Make what is missing.
 
     Args:
-        factory: what scenes are made from. root: an opened data folder. tasks: the files wanted.
-        workers: processes; 0 works in this one.
+        plan: what to make where. tasks: the files wanted. workers: processes; 0 works in this one.
     Yields:
         For every task, in the order of completion, its report, or None where its file was whole already.
     """
     missing = []
     for task in tasks:
-        if _is_whole(cycle_path(root, task), factory.fingerprint):
+        if plan.is_done(task):
             yield None
         else:
             missing.append(task)
+    wanted = {"simulate": [plan.piles], "render": [plan.scenes], "all": [plan.piles, plan.scenes]}
     for split in sorted({task.split for task in missing}):
-        (root / split).mkdir(exist_ok=True)
+        for root in wanted[plan.stage]:
+            (root / split).mkdir(parents=True, exist_ok=True)
     if workers == 0 or not missing:
         for task in missing:
-            yield _make(factory, root, task)
+            yield plan.make(task)
         return
-    yield from _in_parallel(factory, root, missing, workers)
+    yield from _in_parallel(plan, missing, workers)
 
 
-def _in_parallel(
-    factory: SceneFactory, root: Path, tasks: list[CycleTask], workers: int
-) -> Iterator[CycleReport]:
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (factory, root))
+def _in_parallel(plan: Plan, tasks: list[CycleTask], workers: int) -> Iterator[CycleReport]:
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (plan,))
     waiting = iter(tasks)
     running: set[Future[CycleReport]] = set()
     try:
@@ -142,18 +206,22 @@ def _in_parallel(
         for process in processes if running else []:
             process.terminate()
             process.join()
-            for left_over in root.rglob(f".*.{process.pid}{TEMPORARY}"):
-                left_over.unlink(missing_ok=True)
+            for root in _roots(plan):
+                remove_left_overs(root, process.pid)
 
 
-def _start_worker(factory: SceneFactory, root: Path) -> None:
+def _roots(plan: Plan) -> Sequence[Path]:
+    return [root for root in (plan.piles, plan.scenes) if root.is_dir()]
+
+
+def _start_worker(plan: Plan) -> None:
     import torch
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     signal.signal(signal.SIGTERM, lambda *_: os._exit(1))
     torch.set_num_threads(1)
     Thread(target=_end_with_parent, daemon=True).start()
-    _worker["factory"], _worker["root"] = factory, root
+    _worker["plan"] = plan
 
 
 def _end_with_parent() -> None:
@@ -164,37 +232,16 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-_worker: dict[str, Any] = {}  # what a worker process was started with
+_worker: dict[str, Plan] = {}  # what a worker process was started with
 
 
 def _make_in_worker(task: CycleTask) -> CycleReport:
-    return _make(_worker["factory"], _worker["root"], task)
+    return _worker["plan"].make(task)
 
 
-def _make(factory: SceneFactory, root: Path, task: CycleTask) -> CycleReport:
-    cycle = factory.make_cycle(task)
-    start = perf_counter()
-    write_cycle(cycle_path(root, task), cycle.header, cycle.scenes)
-    cycle.times.write += perf_counter() - start
-    header = cycle.header
-    counts = (len(cycle.scenes), header.escaped, header.unsettled, header.empty)
-    return CycleReport(task, *counts, cycle.times)
-
-
-def _is_whole(path: Path, fingerprint: str) -> bool:
-    if not path.exists():
-        return False
+def _made_by(reader: type[CycleFile] | type[PileFile], path: Path) -> str | None:
+    """The fingerprint of the settings that made a file; None where it is damaged: it is made anew."""
     try:
-        return CycleFile(path).header.fingerprint == fingerprint
+        return reader(path).header.fingerprint
     except ValueError:
-        return False  # damaged: made anew
-
-
-def _is_running(temporary: Path) -> bool:
-    try:
-        os.kill(int(temporary.name.split(".")[-2]), 0)
-    except (ValueError, IndexError, ProcessLookupError):
-        return False
-    except PermissionError:
-        return True
-    return True
+        return None

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 MANIFEST = "dataset.json"
+REMEDY = "run pnet-generate with the same part and protocol first"
 
 
 def settings_fingerprint(settings: Mapping[str, Any]) -> str:
@@ -14,15 +15,13 @@ def settings_fingerprint(settings: Mapping[str, Any]) -> str:
     return sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def read_manifest(root: Path) -> dict[str, Any]:
-    """The settings that made a data set."""
+def read_manifest(root: Path, remedy: str = REMEDY) -> dict[str, Any]:
+    """The settings that made a data set. remedy: what to do where there is none."""
     manifest = root / MANIFEST
     try:
         settings = json.loads(manifest.read_text())
     except FileNotFoundError:
-        raise FileNotFoundError(
-            f"{manifest}: no data set there; run pnet-generate with the same part and protocol first"
-        ) from None
+        raise FileNotFoundError(f"{manifest}: no data set there; {remedy}") from None
     except json.JSONDecodeError as fault:
         raise ValueError(f"{manifest}: not readable ({fault}); make the data set anew") from fault
     if not isinstance(settings, dict):

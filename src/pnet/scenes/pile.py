@@ -33,6 +33,18 @@ class Bin:
         inside: NDArray[np.bool_] = np.logical_and(between.all(-1), position[..., 2] >= -margin)
         return inside
 
+    def slabs(self, wall: float) -> list[tuple[Points, Points]]:
+        """Floor and walls as boxes of thickness `wall`, metres: half sizes (3,) and centres (3,)."""
+        w, d, h, half = self.width / 2, self.depth / 2, self.height / 2, wall / 2
+        sides = [
+            ((w + wall, d + wall, half), (0, 0, -half)),
+            ((half, d + wall, h), (w + half, 0, h)),
+            ((half, d + wall, h), (-w - half, 0, h)),
+            ((w + wall, half, h), (0, d + half, h)),
+            ((w + wall, half, h), (0, -d - half, h)),
+        ]
+        return [(np.array(size), np.array(centre, float)) for size, centre in sides]
+
 
 @dataclass(frozen=True, eq=False)
 class Pile:

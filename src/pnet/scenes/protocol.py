@@ -10,6 +10,7 @@ from pnet.records import SceneId
 
 SPLITS = ("train", "val", "test_l", "test_g")
 KINDS = ("pile", "clutter")
+DROPPINGS = ("one_by_one", "anew")
 
 
 @dataclass(frozen=True)
@@ -52,10 +53,11 @@ class CycleTask:
         """The id of the scene after `drop` bodies."""
         return SceneId(self.split, self.kind, self.cycle, self.part_index, drop)
 
-    def rng(self, seed: int, part: str) -> np.random.Generator:
-        """The task's own generator: a pure function of seed, part, grid, part object, kind and cycle."""
+    def rng(self, seed: int, part: str, *more: int) -> np.random.Generator:
+        """The task's own generator: a pure function of seed, part, grid, part object, kind and cycle (and of
+        `more`: a scene's drop)."""
         key = (seed, zlib.crc32(part.encode()), zlib.crc32(self.grid.encode()))
-        return np.random.default_rng([*key, self.part_index, KINDS.index(self.kind), self.cycle])
+        return np.random.default_rng([*key, self.part_index, KINDS.index(self.kind), self.cycle, *more])
 
 
 class Protocol:
@@ -64,6 +66,8 @@ class Protocol:
     Args:
         name: for folders and tables. drop_limit: bodies dropped in a cycle.
         drop_step: a scene is taken after every `drop_step` bodies.
+        dropping: "one_by_one": a pile grows by one body at a time (Table I); "anew": the bin is filled from
+            empty for every number of bodies.
         points: N, points of a scene. splits: by name.
     """
 
@@ -74,16 +78,19 @@ class Protocol:
         points: int,
         splits: Mapping[str, SplitPlan],
         drop_step: int = 1,
+        dropping: str = "one_by_one",
     ) -> None:
         if drop_limit < 1 or drop_step < 1 or points < 1:
             raise ValueError(
                 f"protocol {name}: drop_limit, drop_step and points must be at least 1, got "
                 f"{drop_limit}, {drop_step}, {points}"
             )
+        if dropping not in DROPPINGS:
+            raise ValueError(f"protocol {name}: dropping is {dropping!r}, choose {' or '.join(DROPPINGS)}")
         for split, plan in splits.items():
             _check_split(name, split, plan)
         self.name, self.drop_limit, self.drop_step, self.points = name, drop_limit, drop_step, points
-        self.splits = dict(splits)
+        self.splits, self.dropping = dict(splits), dropping
         self._check_disjoint()
 
     def scene_drops(self) -> list[int]:

@@ -18,12 +18,15 @@ class View:
     Attributes:
         depth: (height, width) planar depth, metres, 0 where no body is.
         instance: (height, width) int64 index of the body, −1 where none is.
+        incidence: (height, width) cosine of the angle between viewing ray and surface normal, 0 where no
+            body is.
         silhouette: (d,) pixels of each body alone, not clipped by the image.
         visible: (d,) pixels of each body in this view.
     """
 
     depth: NDArray[np.float64]
     instance: NDArray[np.int64]
+    incidence: NDArray[np.float32]
     silhouette: NDArray[np.int64]
     visible: NDArray[np.int64]
 
@@ -52,21 +55,24 @@ def render_view(camera: Camera, mesh: trimesh.Trimesh, R: Points, t: Points) -> 
     """
     depth = np.full(camera.height * camera.width, np.inf)
     instance = np.full(camera.height * camera.width, -1, np.int64)
+    incidence = np.zeros(camera.height * camera.width, np.float32)
     silhouette = np.zeros(len(R), np.int64)
     if len(R):
         body, u, v = _windows(camera, mesh, R, t)
-        hit, z = _cast(mesh, R, t, body, camera.rays(u, v))
+        hit, z, cosine = _cast(mesh, R, t, body, camera.rays(u, v))
         body, u, v = body[hit], u[hit], v[hit]
         silhouette = np.bincount(body, minlength=len(R))
         inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
         inside &= (z >= camera.near) & (z <= camera.far)
-        body, pixel, z = body[inside], (v * camera.width + u)[inside], z[inside]
+        body, pixel, z, cosine = body[inside], (v * camera.width + u)[inside], z[inside], cosine[inside]
         order = np.lexsort((body, -z))  # the nearest is written last and stays
         depth[pixel[order]], instance[pixel[order]] = z[order], body[order]
+        incidence[pixel[order]] = cosine[order]
     visible = np.bincount(instance[instance >= 0], minlength=len(R))
     shape = (camera.height, camera.width)
     depth[instance < 0] = 0.0
-    return View(depth.reshape(shape), instance.reshape(shape), silhouette, visible)
+    images = depth.reshape(shape), instance.reshape(shape), incidence.reshape(shape)
+    return View(*images, silhouette, visible)
 
 
 def _windows(
@@ -91,8 +97,11 @@ def _windows(
 
 def _cast(
     mesh: trimesh.Trimesh, R: Points, t: Points, body: NDArray[np.int64], rays: Points
-) -> tuple[NDArray[np.bool_], Points]:
-    """Which rays hit, and the planar depth of the hits. rays: (n, 3) camera frame with z = 1."""
+) -> tuple[NDArray[np.bool_], Points, NDArray[np.float32]]:
+    """Which rays hit, the planar depth of the hits, and the cosine at which they do.
+
+    rays: (n, 3) camera frame with z = 1.
+    """
     from embreex import rtcore_scene
     from embreex.mesh_construction import TriangleMesh
 
@@ -103,7 +112,10 @@ def _cast(
     scene = rtcore_scene.EmbreeScene()
     TriangleMesh(scene, (mesh.vertices[mesh.faces] / radius).astype(np.float32))
     local_origin = np.einsum("nji,nj->ni", R[body], origin) / radius
-    local_rays = np.einsum("nji,nj->ni", R[body], rays)
-    found = scene.run(local_origin.astype(np.float32), local_rays.astype(np.float32), query="DISTANCE")
-    hit = np.isfinite(found) & (found < 1e30)
-    return hit, start_depth[body[hit]] + found[hit].astype(np.float64) * radius
+    local_rays = np.einsum("nji,nj->ni", R[body], rays).astype(np.float32)
+    found = scene.run(local_origin.astype(np.float32), local_rays, query="INTERSECT", output=True)
+    distance, hit = found["tfar"], found["geomID"] >= 0
+    normal, ray = found["Ng"][hit], local_rays[hit]
+    length = np.linalg.norm(normal, axis=1) * np.linalg.norm(ray, axis=1)
+    cosine = np.minimum(np.abs(np.einsum("ni,ni->n", normal, ray)) / length, 1)
+    return hit, start_depth[body[hit]] + distance[hit].astype(np.float64) * radius, cosine

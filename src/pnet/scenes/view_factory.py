@@ -1,0 +1,97 @@
+"""The second stage: from a pile to a scene as a camera sees it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from time import perf_counter
+
+import numpy as np
+import trimesh
+
+from pnet.geometry.camera import Camera
+from pnet.ops.sampling import farthest_point_order
+from pnet.parts.base import ParametricPart
+from pnet.records import Scene, SceneId
+from pnet.scenes.edges import image_edges
+from pnet.scenes.noise import NoNoise, SensorNoise
+from pnet.scenes.pile import Pile
+from pnet.scenes.rendering import render_view
+from pnet.scenes.viewpoints import Viewpoints
+
+EDGE_STEP = 0.002  # neighbouring pixels whose depths differ by more have an edge between them, metres
+
+
+@dataclass
+class ViewTimes:
+    """Seconds spent on views, by stage."""
+
+    render: float = 0.0
+    sample: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class ViewFactory:
+    """Everything that a pile's scene is made from.
+
+    Attributes:
+        part: what lies there. camera, viewpoints, noise: see their classes. points: N of a scene.
+    """
+
+    part: ParametricPart
+    camera: Camera
+    viewpoints: Viewpoints
+    noise: SensorNoise
+    points: int
+
+    def view(
+        self,
+        pile: Pile,
+        parameters: Sequence[float],
+        scene_id: SceneId,
+        rng: np.random.Generator,
+        times: ViewTimes | None = None,
+    ) -> Scene | None:
+        """Render, measure and sample one pile; None where the camera sees no body.
+
+        Args:
+            pile: in the world frame. parameters: (k) of its part object, metres.
+            scene_id: of the scene. rng: of viewpoint and noise, in this order. times: to add to.
+        """
+        times = times or ViewTimes()
+        start = perf_counter()
+        R_camera, t_camera = self.viewpoints.draw(rng)
+        R, t = R_camera @ pile.R, pile.t @ R_camera.T + t_camera
+        image = render_view(self.camera, self._mesh(tuple(parameters)), R, t)
+        rendered = perf_counter()
+        times.render += rendered - start
+        pixels = np.flatnonzero(image.instance >= 0)
+        if not len(pixels):
+            return None
+        cloud = self.camera.depth_to_points(image.depth).reshape(-1, 3)[pixels].astype(np.float32)
+        incidence = np.rint(255 * image.incidence.reshape(-1)[pixels]).astype(np.uint8)
+        edge = image_edges(image.depth, EDGE_STEP).reshape(-1)[pixels]
+        if not isinstance(self.noise, NoNoise):
+            cloud, kept = self.noise(cloud, incidence / 255, edge, self.camera, rng)
+            cloud, pixels, incidence, edge = cloud[kept], pixels[kept], incidence[kept], edge[kept]
+            if not len(pixels):
+                return None
+        order = farthest_point_order(cloud, self.points)
+        times.sample += perf_counter() - rendered
+        return Scene(
+            points=cloud[order],
+            instance=image.instance.reshape(-1)[pixels[order]],
+            R=R,
+            t=t,
+            parameters=np.tile(np.array(parameters), (len(R), 1)),
+            visibility=image.visibility,
+            occlusion=image.occlusion,
+            camera=self.camera,
+            part=self.part.name,
+            id=scene_id,
+            incidence=incidence[order],
+            edge=edge[order],
+        )
+
+    @lru_cache(maxsize=256)  # noqa: B019  as long-lived as its process
+    def _mesh(self, parameters: tuple[float, ...]) -> trimesh.Trimesh:
+        return self.part.mesh(np.array(parameters))
