@@ -78,16 +78,19 @@ def build_data(cfg: DictConfig, parts: Parts) -> SceneDataModule:
         cfg.data.workers,
         cfg.seed,
         parts.backbone.pyramid,
-        share(cfg.data.learn),
+        share("data.learn", cfg.data.learn),
+        instantiate(cfg.views),
+        instantiate(cfg.noise),
+        None if cfg.data.clutter is None else share("data.clutter", cfg.data.clutter),
     )
 
 
-def share(value: object) -> float:
-    """A share such as 0.2 or 1/5, as a number."""
+def share(key: str, value: object) -> float:
+    """A share such as 0.2 or 1/5, as a number. key: of the setting."""
     try:
         return float(Fraction(str(value)))
     except (ValueError, ZeroDivisionError, OverflowError):
-        raise ValueError(f"data.learn is {value!r}, expected a share in (0, 1], for instance 1/3") from None
+        raise ValueError(f"{key} is {value!r}, expected a share, for instance 1/3") from None
 
 
 @lru_cache

@@ -119,7 +119,8 @@ def is_complete(cfg: DictConfig) -> bool:
     root = Path(cfg.data.root)
     if not (root / MANIFEST).is_file():
         return False
-    tasks = plan_tasks(instantiate(cfg.part), instantiate(cfg.protocol))
+    part = instantiate(cfg.part)
+    tasks = plan_tasks(part, instantiate(cfg.protocol).for_part(part.name))
     if read_manifest(root) != manifest_of(making_settings(cfg), tasks):
         return False
     return all(cycle_path(root, task).is_file() for task in tasks)
@@ -153,7 +154,8 @@ def build_plan(cfg: DictConfig) -> "Plan":
         if split not in SPLITS:
             raise ValueError(f"noise_in holds {split!r}, choose from {', '.join(SPLITS)}")
     settings = making_settings(cfg)
-    part, protocol = instantiate(cfg.part), instantiate(cfg.protocol)
+    part = instantiate(cfg.part)
+    protocol = instantiate(cfg.protocol).for_part(part.name)
     piles = PileFactory(
         part=part,
         protocol=protocol,

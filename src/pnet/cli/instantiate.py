@@ -20,6 +20,7 @@ ALLOWED = (
     "pnet.scenes.viewpoints.",
     "pnet.data.augmentation.",
     "pnet.data.module.",
+    "pnet.data.views.",
     "pnet.backbones.",
     "pnet.models.",
     "pnet.postprocess.",

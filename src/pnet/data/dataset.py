@@ -9,8 +9,9 @@ from torch import Tensor
 from torch.utils.data import Dataset, Sampler, default_collate
 
 from pnet.data.augmentation import Augmentation
-from pnet.data.scene_folder import SceneFolder
+from pnet.data.scene_order import SceneOrder
 from pnet.data.targets import point_labels, pose_labels
+from pnet.data.views import SceneSource
 from pnet.ops.pyramid import Pyramid, Tables
 from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointChoice
@@ -34,7 +35,7 @@ class LabelledScenes(Dataset[Item]):
 
     def __init__(
         self,
-        scenes: SceneFolder,
+        scenes: SceneSource,
         chain: KeypointChain,
         choice: KeypointChoice,
         points: int | None = None,
@@ -58,7 +59,8 @@ class LabelledScenes(Dataset[Item]):
 
     def __getitem__(self, draw: Draw | int) -> Item:
         index, epoch = (draw, 0) if isinstance(draw, int) else draw
-        scene = first_points(self.scenes[index], self.points)
+        chance = np.random.default_rng([self._seed, epoch, index, 1])  # of view and noise
+        scene = first_points(self.scenes.draw(index, chance), self.points)
         if self._augmentation is not None:
             scene = self._augmentation(scene, np.random.default_rng([self._seed, epoch, index]))
         labels = point_labels(scene, self._chain, self._choice)
@@ -74,7 +76,8 @@ def first_points(scene: Scene, count: int | None) -> Scene:
     """The scene with its first `count` points only; None keeps all."""
     if count is None:
         return scene
-    return replace(scene, points=scene.points[:count], instance=scene.instance[:count])
+    arrays = {name: getattr(scene, name) for name in ("points", "instance", "incidence", "edge")}
+    return replace(scene, **{name: a[:count] for name, a in arrays.items() if a is not None})
 
 
 def collate(items: list[Item]) -> Batch:
@@ -83,15 +86,15 @@ def collate(items: list[Item]) -> Batch:
 
 
 class EpochSampler(Sampler[Draw]):
-    """A new permutation each epoch, a pure function of (seed, epoch).
+    """Cuts an endless order of scenes into epochs, so that every scene of it is seen equally often.
 
     Args:
-        size: how many scenes there are. draws: how many make an epoch; None: each scene once.
+        order: which scene comes when. draws: how many make an epoch; None: each scene once.
         rank, world: of several processes that train together, each takes every `world`-th of world * draws.
     """
 
-    def __init__(self, size: int, seed: int, draws: int | None = None, rank: int = 0, world: int = 1) -> None:
-        self._size, self._seed, self._draws = size, seed, draws or size
+    def __init__(self, order: SceneOrder, draws: int | None = None, rank: int = 0, world: int = 1) -> None:
+        self._order, self._draws = order, draws or len(order)
         self._rank, self._world = rank, world
         self._epoch = 0
 
@@ -103,11 +106,6 @@ class EpochSampler(Sampler[Draw]):
         return self._draws
 
     def __iter__(self) -> Iterator[Draw]:
-        # an endless row of permutations, cut into epochs, so that every scene is seen equally often
         drawn = self._draws * self._world
-        known = -1
         for position in range(self._epoch * drawn + self._rank, (self._epoch + 1) * drawn, self._world):
-            turn, place = divmod(position, self._size)
-            if turn != known:
-                order, known = np.random.default_rng([self._seed, turn]).permutation(self._size), turn
-            yield int(order[place]), self._epoch
+            yield self._order[position], self._epoch

@@ -12,10 +12,13 @@ from torch.utils.data import DataLoader
 from pnet.data.augmentation import Augmentation
 from pnet.data.dataset import EpochSampler, LabelledScenes, collate
 from pnet.data.scene_folder import SceneFolder
+from pnet.data.scene_order import mixed_order
+from pnet.data.views import SceneSource, StoredViews, Views
 from pnet.ops.pyramid import Pyramid
 from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointChoice, KeypointRule
 from pnet.parts.spread import spread_order
+from pnet.scenes.noise import NoNoise, SensorNoise
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,8 @@ class SceneDataModule(lightning.LightningDataModule):
         batch_size: scenes. draws: scenes of an epoch; None: each once.
         val_every: keep every so many validation scenes. workers: loader processes. seed: of order and chance.
         pyramid: the backbone's neighbour tables for the loaders to find, or None.
+        views: where the training's scenes come from; None: the stored ones. noise: added to them; None: none.
+        clutter: share of clutter scenes among those that a training draws; None: as many as there are.
         learn: share of the training's part objects that are learnt, spread over the grid, in (0, 1] (the
             paper's Table IV: 1/3 and 1/5). At least one is.
     """
@@ -70,6 +75,9 @@ class SceneDataModule(lightning.LightningDataModule):
         seed: int,
         pyramid: Pyramid | None = None,
         learn: float = 1.0,
+        views: Views | None = None,
+        noise: SensorNoise | None = None,
+        clutter: float | None = None,
     ) -> None:
         super().__init__()
         if not 0 < learn <= 1:
@@ -82,14 +90,16 @@ class SceneDataModule(lightning.LightningDataModule):
         self._augmentation, self._batch_size, self._draws = augmentation, batch_size, draws
         self._val_every, self._workers, self._seed = val_every, workers, seed
         self._pyramid, self._learn = pyramid, learn
+        self._views, self._noise, self._clutter = views or StoredViews(), noise or NoNoise(), clutter
 
     def scenes(self, split: str, every: int = 1) -> SceneFolder:
         """The scenes of a split."""
         return SceneFolder(self.root, split, self.part.name, every)
 
-    def train_scenes(self) -> SceneFolder:
+    def train_scenes(self) -> SceneSource:
         """The training scenes of the part objects that are learnt."""
-        return SceneFolder(self.root, "train", self.part.name, keep=self._learnt if self._learn < 1 else None)
+        keep = self._learnt if self._learn < 1 else None
+        return self._views.open(self.root, self.part, self.points, self._noise, keep)
 
     def _learnt(self, objects: set[int]) -> set[int]:
         """Of the part objects (places in the L grid) those to learn."""
@@ -115,7 +125,8 @@ class SceneDataModule(lightning.LightningDataModule):
                 f"{self._draws or len(scenes)} scenes; lower it or make more scenes"
             )
         rank, world = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
-        sampler = EpochSampler(len(scenes), self._seed, self._draws, rank, world)
+        order = mixed_order([scene.kind for scene in scenes.ids], self._seed, self._clutter)
+        sampler = EpochSampler(order, self._draws, rank, world)
         return self._loader(dataset, sampler, drop_last=True)
 
     def val_dataloader(self) -> DataLoader[Any]:

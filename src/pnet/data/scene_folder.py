@@ -5,6 +5,8 @@ from collections.abc import Callable, Sequence
 from itertools import accumulate
 from pathlib import Path
 
+import numpy as np
+
 from pnet.records import Scene, SceneId
 from pnet.scenes.manifest import MANIFEST, read_manifest
 from pnet.scenes.record_file import SUFFIX
@@ -71,6 +73,10 @@ class SceneFolder(Sequence[Scene]):
         number = bisect_right(self._ends, index)
         within = index - (self._ends[number - 1] if number else 0)
         return self._file(self._paths[number]).scene(self._index[number][within])
+
+    def draw(self, index: int, rng: np.random.Generator) -> Scene:
+        """Scene `index`; nothing of it is left to chance."""
+        return self[index]
 
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "_open": {}}

@@ -94,8 +94,8 @@ class StructuredLightNoise:
     incidence, were measured by Nguyen, Izadi and Lovell, "Modeling Kinect Sensor Noise for Improved 3D
     Reconstruction and Tracking", 3DIMPVT 2012.
 
-    Simplified: σ_d grows as 1 / cos(incidence), up to `MIN_COSINE`, where Nguyen et al. fit a polynomial in
-    the angle to one device; the lateral noise is the same at all angles. Pixels err apart from
+    Simplified: σ_d grows as 1 / cos(incidence), down to `MIN_COSINE`, where Nguyen et al. fit a function of
+    angle and distance to one device; the lateral noise is the same at all angles. Pixels err apart from
     each other, though matching windows make neighbours err alike. What the projector or the second camera
     does not see is measured all the same; so are dark, shiny and translucent surfaces. There is no bias.
     At edges pixels are missing but never lie between the surfaces. Depths that come out beyond the

@@ -3,6 +3,7 @@
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -68,6 +69,7 @@ class Protocol:
         drop_step: a scene is taken after every `drop_step` bodies.
         dropping: "one_by_one": a pile grows by one body at a time (Table I); "anew": the bin is filled from
             empty for every number of bodies.
+        by_part: what differs for some templates: name → drop_limit, splits, or both.
         points: N, points of a scene. splits: by name.
     """
 
@@ -79,6 +81,7 @@ class Protocol:
         splits: Mapping[str, SplitPlan],
         drop_step: int = 1,
         dropping: str = "one_by_one",
+        by_part: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> None:
         if drop_limit < 1 or drop_step < 1 or points < 1:
             raise ValueError(
@@ -91,7 +94,20 @@ class Protocol:
             _check_split(name, split, plan)
         self.name, self.drop_limit, self.drop_step, self.points = name, drop_limit, drop_step, points
         self.splits, self.dropping = dict(splits), dropping
+        self._by_part = {part: self._varied(part, changes) for part, changes in (by_part or {}).items()}
         self._check_disjoint()
+
+    def _varied(self, part: str, changes: Mapping[str, Any]) -> "Protocol":
+        unknown = sorted(set(changes) - {"drop_limit", "splits"})
+        if unknown:
+            raise ValueError(f"protocol {self.name}, by_part.{part}: {unknown[0]} cannot differ by part")
+        given = {"drop_limit": self.drop_limit, "splits": self.splits, **changes}
+        rest: dict[str, Any] = {"points": self.points, "drop_step": self.drop_step, "dropping": self.dropping}
+        return Protocol(f"{self.name}, {part}", **rest, **given)
+
+    def for_part(self, part: str) -> "Protocol":
+        """The plan for a template."""
+        return self._by_part.get(part, self)
 
     def scene_drops(self) -> list[int]:
         """Numbers of dropped bodies after which a scene is taken; the full bin always."""

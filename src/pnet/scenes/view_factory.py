@@ -18,7 +18,7 @@ from pnet.scenes.pile import Pile
 from pnet.scenes.rendering import render_view
 from pnet.scenes.viewpoints import Viewpoints
 
-EDGE_STEP = 0.002  # neighbouring pixels whose depths differ by more have an edge between them, metres
+EDGE_STEP = 0.003  # neighbouring pixels whose depths differ by more have an edge between them, metres
 
 
 @dataclass

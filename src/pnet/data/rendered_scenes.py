@@ -1,0 +1,81 @@
+"""Scenes that are rendered when they are read: a new view of a stored pile each time."""
+
+from bisect import bisect_right
+from collections.abc import Callable
+from itertools import accumulate
+from pathlib import Path
+
+import numpy as np
+
+from pnet.records import Scene, SceneId
+from pnet.scenes.pile_store import PileFile
+from pnet.scenes.record_file import SUFFIX
+from pnet.scenes.view_factory import ViewFactory
+
+ATTEMPTS = 20  # views of one pile that may show no body
+
+
+class RenderedScenes:
+    """Views of all piles of a split, each from a place and with a noise of its own.
+
+    Args:
+        piles: the folder of piles. split: "train", … views: how a pile is seen.
+        keep: of the part objects there (places in their grid) those to keep; None: all.
+    Attributes:
+        ids: of the scenes, in order. points_per_scene: N.
+    Raises:
+        FileNotFoundError, ValueError: where piles are missing, damaged or of another part.
+    """
+
+    def __init__(
+        self,
+        piles: Path,
+        split: str,
+        views: ViewFactory,
+        keep: Callable[[set[int]], set[int]] | None = None,
+    ) -> None:
+        files = [PileFile(path) for path in sorted((piles / split).glob(f"[!.]*{SUFFIX}"))]
+        if not files:
+            raise FileNotFoundError(
+                f"{piles / split}: no piles there; run pnet-generate with the same part and protocol"
+            )
+        for file in files:
+            if file.header.part != views.part.name:
+                raise ValueError(f"{file.path}: a pile of {file.header.part}, not of {views.part.name}")
+        if keep is not None:
+            objects = keep({file.header.part_index for file in files})
+            files = [file for file in files if file.header.part_index in objects]
+        headers = [file.header for file in files]
+        self.ids = [
+            SceneId(h.split, h.kind, h.cycle, h.part_index, drop) for h in headers for drop in h.drops
+        ]
+        self.points_per_scene = views.points
+        self._views, self._paths = views, [file.path for file in files]
+        self._ends = list(accumulate(len(file) for file in files))
+        # opened again where they are read: file handles do not travel to the loader's workers
+        self._open: dict[Path, PileFile] = {}
+
+    def __len__(self) -> int:
+        return self._ends[-1]
+
+    def draw(self, index: int, rng: np.random.Generator) -> Scene:
+        """A view of pile `index`; `rng` alone decides which."""
+        number = bisect_right(self._ends, index)
+        file = self._file(self._paths[number])
+        pile = file.pile(index - (self._ends[number - 1] if number else 0))
+        for _ in range(ATTEMPTS):
+            scene = self._views.view(pile, file.header.parameters, self.ids[index], rng)
+            if scene is not None:
+                return scene
+        raise ValueError(
+            f"{file.path}: the camera saw no body in {ATTEMPTS} views of {self.ids[index]}; "
+            "narrow views.distance or views.tilt"
+        )
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_open": {}}
+
+    def _file(self, path: Path) -> PileFile:
+        if path not in self._open:
+            self._open[path] = PileFile(path)
+        return self._open[path]
