@@ -11,10 +11,15 @@ from hypothesis import strategies as st
 from pnet.data.augmentation import Augmentation
 from pnet.data.dataset import EpochSampler, LabelledScenes, collate, first_points
 from pnet.data.scene_folder import SceneFolder
+from pnet.data.scene_order import Permutations
 from pnet.data.targets import point_labels
 from pnet.parts.choice import KeypointChoice
 
 CHOICE = KeypointChoice()
+
+
+def row_of(size: int, seed: int, draws: int | None = None, rank: int = 0, world: int = 1) -> EpochSampler:
+    return EpochSampler(Permutations(range(size), seed), draws, rank, world)
 
 
 def epoch(sampler: EpochSampler, number: int) -> list[int]:
@@ -26,7 +31,7 @@ def epoch(sampler: EpochSampler, number: int) -> list[int]:
 
 @given(size=st.integers(1, 12), draws=st.integers(1, 30), seed=st.integers(0, 5))
 def test_epochs_cut_an_endless_row_of_permutations(size, draws, seed):
-    sampler = EpochSampler(size, seed, draws)
+    sampler = row_of(size, seed, draws)
     row = [index for number in range(6) for index in epoch(sampler, number)]
     assert len(row) == 6 * draws and len(sampler) == draws
     for start in range(0, len(row) - size + 1, size):
@@ -36,16 +41,16 @@ def test_epochs_cut_an_endless_row_of_permutations(size, draws, seed):
 
 
 def test_an_epoch_is_a_pure_function_of_seed_and_number():
-    first, again = EpochSampler(50, 3, 20), EpochSampler(50, 3, 20)
+    first, again = row_of(50, 3, 20), row_of(50, 3, 20)
     epoch(first, 0)
     epoch(first, 1)
     assert epoch(first, 7) == epoch(again, 7)
     assert epoch(again, 7) != epoch(again, 8)
-    assert epoch(EpochSampler(50, 4, 20), 7) != epoch(again, 7)
+    assert epoch(row_of(50, 4, 20), 7) != epoch(again, 7)
 
 
 def test_without_draws_each_scene_comes_once():
-    sampler = EpochSampler(9, 0)
+    sampler = row_of(9, 0)
     assert sorted(epoch(sampler, 4)) == list(range(9)) and len(sampler) == 9
 
 
@@ -100,7 +105,7 @@ def test_collate_stacks(folder, tn34):
 
 
 def parts_of_an_epoch(size: int, seed: int, draws: int, world: int, number: int) -> list[list[int]]:
-    return [epoch(EpochSampler(size, seed, draws, rank, world), number) for rank in range(world)]
+    return [epoch(row_of(size, seed, draws, rank, world), number) for rank in range(world)]
 
 
 @given(
@@ -114,16 +119,16 @@ def test_processes_together_see_what_one_would(size, seed, draws, world, number)
     """Taken in turn they make the row of a single process whose epochs are `world` times as long."""
     each = parts_of_an_epoch(size, seed, draws, world, number)
     assert [len(part) for part in each] == [draws] * world
-    assert [len(EpochSampler(size, seed, draws, rank, world)) for rank in range(world)] == [draws] * world
+    assert [len(row_of(size, seed, draws, rank, world)) for rank in range(world)] == [draws] * world
     together = [index for position in zip(*each, strict=True) for index in position]
-    assert together == epoch(EpochSampler(size, seed, world * draws), number)
+    assert together == epoch(row_of(size, seed, world * draws), number)
 
 
 @given(size=st.integers(2, 12), seed=st.integers(0, 5), world=st.integers(2, 5))
 def test_no_scene_comes_to_two_processes_in_one_turn(size, seed, world):
     """Epochs that end with a permutation: each scene once in each."""
     each = [
-        epoch(EpochSampler(size * world, seed, size, rank, world), number)
+        epoch(row_of(size * world, seed, size, rank, world), number)
         for number in range(2)
         for rank in range(world)
     ]
@@ -135,19 +140,17 @@ def test_no_scene_comes_to_two_processes_in_one_turn(size, seed, world):
 @given(size=st.integers(1, 12), seed=st.integers(0, 5), draws=st.none() | st.integers(1, 20))
 def test_one_process_alone_is_the_default(size, seed, draws):
     for number in (0, 3):
-        assert epoch(EpochSampler(size, seed, draws, 0, 1), number) == epoch(
-            EpochSampler(size, seed, draws), number
-        )
+        assert epoch(row_of(size, seed, draws, 0, 1), number) == epoch(row_of(size, seed, draws), number)
 
 
 def test_without_draws_each_process_takes_as_many_as_there_are_scenes():
-    each = [epoch(EpochSampler(5, 0, None, rank, 3), 1) for rank in range(3)]
+    each = [epoch(row_of(5, 0, None, rank, 3), 1) for rank in range(3)]
     assert [len(part) for part in each] == [5, 5, 5]
     assert Counter(index for part in each for index in part) == dict.fromkeys(range(5), 3)
 
 
 def test_the_draws_say_their_epoch_to_every_process():
-    sampler = EpochSampler(6, 0, 4, rank=1, world=2)
+    sampler = row_of(6, 0, 4, rank=1, world=2)
     sampler.set_epoch(3)
     assert [number for _, number in sampler] == [3] * 4
 
@@ -155,5 +158,5 @@ def test_the_draws_say_their_epoch_to_every_process():
 def test_the_order_of_one_process_is_as_it_was():
     """What trainings of before repeat: seed 3, epochs of five out of seven scenes."""
     row = [int(i) for turn in range(3) for i in np.random.default_rng([3, turn]).permutation(7)]
-    sampler = EpochSampler(7, 3, 5)
+    sampler = row_of(7, 3, 5)
     assert [epoch(sampler, number) for number in range(4)] == [row[5 * n : 5 * n + 5] for n in range(4)]

@@ -53,32 +53,37 @@ def render_view(camera: Camera, mesh: trimesh.Trimesh, R: Points, t: Points) -> 
     Returns:
         The `View`; bodies not wholly in front of the camera's near plane are an error.
     """
-    depth = np.full(camera.height * camera.width, np.inf)
-    instance = np.full(camera.height * camera.width, -1, np.int64)
-    incidence = np.zeros(camera.height * camera.width, np.float32)
-    silhouette = np.zeros(len(R), np.int64)
-    if len(R):
-        body, u, v = _windows(camera, mesh, R, t)
-        hit, z, cosine = _cast(mesh, R, t, body, camera.rays(u, v))
-        body, u, v = body[hit], u[hit], v[hit]
-        silhouette = np.bincount(body, minlength=len(R))
-        inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        inside &= (z >= camera.near) & (z <= camera.far)
-        body, pixel, z, cosine = body[inside], (v * camera.width + u)[inside], z[inside], cosine[inside]
-        order = np.lexsort((body, -z))  # the nearest is written last and stays
-        depth[pixel[order]], instance[pixel[order]] = z[order], body[order]
-        incidence[pixel[order]] = cosine[order]
-    visible = np.bincount(instance[instance >= 0], minlength=len(R))
     shape = (camera.height, camera.width)
+    depth, instance = np.full(shape, np.inf), np.full(shape, -1, np.int64)
+    incidence, silhouette = np.zeros(shape, np.float32), np.zeros(len(R), np.int64)
+    if len(R):
+        low, size = _windows(camera, mesh, R, t)
+        caster = _Caster(mesh)
+        for i in range(len(R)):
+            u, v = low[i, 0] + np.arange(size[i, 0]), low[i, 1] + np.arange(size[i, 1])
+            hit, z, cosine = caster.cast(camera, R[i], t[i], u, v)
+            silhouette[i] = hit.sum()
+            # the part of the window that lies in the image
+            rows, columns = (slice(*np.searchsorted(a, (0, n))) for a, n in zip((v, u), shape, strict=True))
+            window = (slice(*_ends(v[rows])), slice(*_ends(u[columns])))
+            hit, z, cosine = hit[rows, columns], z[rows, columns], cosine[rows, columns]
+            nearest = hit & (z < depth[window]) & (z >= camera.near) & (z <= camera.far)
+            depth[window][nearest], instance[window][nearest] = z[nearest], i
+            incidence[window][nearest] = cosine[nearest]
+    visible = np.bincount(instance[instance >= 0], minlength=len(R))
     depth[instance < 0] = 0.0
-    images = depth.reshape(shape), instance.reshape(shape), incidence.reshape(shape)
-    return View(*images, silhouette, visible)
+    return View(depth, instance, incidence, silhouette, visible)
+
+
+def _ends(pixels: NDArray[np.int64]) -> tuple[int, int]:
+    """First and one past the last of consecutive pixels."""
+    return (int(pixels[0]), int(pixels[-1]) + 1) if len(pixels) else (0, 0)
 
 
 def _windows(
     camera: Camera, mesh: trimesh.Trimesh, R: Points, t: Points
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Body index and pixel u, v of every ray that may meet a body."""
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First pixel u, v (d, 2) and size (d, 2) of the rectangles of pixels whose rays may meet a body."""
     corners = np.einsum("dij,nj->dni", R, mesh.vertices) + t[:, None]
     if corners[..., 2].min() <= camera.near:
         raise ValueError(
@@ -87,35 +92,39 @@ def _windows(
         )
     pixels = camera.project(corners)
     low = np.ceil(pixels.min(1)).astype(np.int64)
-    size = np.floor(pixels.max(1)).astype(np.int64) - low + 1
-    count = size.prod(1)
-    body = np.repeat(np.arange(len(R)), count)
-    within = np.arange(len(body)) - np.repeat(np.cumsum(count) - count, count)
-    v, u = np.divmod(within, size[body, 0])
-    return body, u + low[body, 0], v + low[body, 1]
+    return low, np.maximum(np.floor(pixels.max(1)).astype(np.int64) - low + 1, 0)
 
 
-def _cast(
-    mesh: trimesh.Trimesh, R: Points, t: Points, body: NDArray[np.int64], rays: Points
-) -> tuple[NDArray[np.bool_], Points, NDArray[np.float32]]:
-    """Which rays hit, the planar depth of the hits, and the cosine at which they do.
+class _Caster:
+    """Rays against one part object, in its own frame and in units of its radius: single precision is enough
+    there."""
 
-    rays: (n, 3) camera frame with z = 1.
-    """
-    from embreex import rtcore_scene
-    from embreex.mesh_construction import TriangleMesh
+    def __init__(self, mesh: trimesh.Trimesh) -> None:
+        from embreex import rtcore_scene
+        from embreex.mesh_construction import TriangleMesh
 
-    # single precision in the part's own frame and size: start near the body, in units of its radius
-    radius = float(np.linalg.norm(mesh.vertices, axis=1).max())
-    start_depth = t[:, 2] - 1.5 * radius
-    origin = rays * start_depth[body, None] - t[body]
-    scene = rtcore_scene.EmbreeScene()
-    TriangleMesh(scene, (mesh.vertices[mesh.faces] / radius).astype(np.float32))
-    local_origin = np.einsum("nji,nj->ni", R[body], origin) / radius
-    local_rays = np.einsum("nji,nj->ni", R[body], rays).astype(np.float32)
-    found = scene.run(local_origin.astype(np.float32), local_rays, query="INTERSECT", output=True)
-    distance, hit = found["tfar"], found["geomID"] >= 0
-    normal, ray = found["Ng"][hit], local_rays[hit]
-    length = np.linalg.norm(normal, axis=1) * np.linalg.norm(ray, axis=1)
-    cosine = np.minimum(np.abs(np.einsum("ni,ni->n", normal, ray)) / length, 1)
-    return hit, start_depth[body[hit]] + distance[hit].astype(np.float64) * radius, cosine
+        self._radius = float(np.linalg.norm(mesh.vertices, axis=1).max())
+        self._scene = rtcore_scene.EmbreeScene()
+        TriangleMesh(self._scene, (mesh.vertices[mesh.faces] / self._radius).astype(np.float32))
+
+    def cast(
+        self, camera: Camera, R: Points, t: Points, u: NDArray[np.int64], v: NDArray[np.int64]
+    ) -> tuple[NDArray[np.bool_], Points, NDArray[np.float32]]:
+        """Rays of the pixels u (w,) × v (h,) at a body with pose R (3, 3), t (3,) part → camera, metres.
+
+        Returns:
+            (h, w) which hit, the planar depth of the hits, and the cosine at which they do.
+        """
+        x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+        ray = (x[None, :, None] * R[0] + y[:, None, None] * R[1] + R[2]).reshape(-1, 3)  # Rᵀ (x, y, 1)
+        start = t[2] - 1.5 * self._radius  # near the body, for the precision
+        origin = ((start * ray - t @ R) / self._radius).astype(np.float32)
+        ray = ray.astype(np.float32)
+        found = self._scene.run(origin, ray, query="INTERSECT", output=True)
+        hit = found["geomID"] >= 0
+        z, normal = start + found["tfar"].astype(np.float64) * self._radius, found["Ng"]
+        with np.errstate(invalid="ignore", divide="ignore"):  # rays that miss have no normal
+            cosine = np.abs(np.einsum("ni,ni->n", normal, ray))
+            cosine /= np.sqrt(np.einsum("ni,ni->n", normal, normal) * np.einsum("ni,ni->n", ray, ray))
+        shape = (len(v), len(u))
+        return hit.reshape(shape), z.reshape(shape), np.minimum(cosine, 1).reshape(shape)

@@ -67,7 +67,9 @@ class ViewFactory:
         pixels = np.flatnonzero(image.instance >= 0)
         if not len(pixels):
             return None
-        cloud = self.camera.depth_to_points(image.depth).reshape(-1, 3)[pixels].astype(np.float32)
+        v, u = np.divmod(pixels, self.camera.width)
+        depth = image.depth.reshape(-1)[pixels, None]
+        cloud = (self.camera.rays(u, v) * depth).astype(np.float32)
         incidence = np.rint(255 * image.incidence.reshape(-1)[pixels]).astype(np.uint8)
         edge = image_edges(image.depth, EDGE_STEP).reshape(-1)[pixels]
         if not isinstance(self.noise, NoNoise):
