@@ -22,8 +22,11 @@ from pnet.cli.instantiate import instantiate
 from pnet.geometry.camera import Camera
 from pnet.ops.sampling import farthest_point_order
 from pnet.scenes.factory import SceneFactory
+from pnet.scenes.noise import NoNoise
+from pnet.scenes.pile_factory import PileFactory
 from pnet.scenes.protocol import CycleTask, Protocol
 from pnet.scenes.rendering import render_view
+from pnet.scenes.view_factory import ViewFactory
 
 matplotlib.use("Agg")  # no screen
 
@@ -64,17 +67,11 @@ class Timing:
 
 def make_bin() -> NutBin:
     """Drop the nuts into the default bin; without PyBullet they hang in it as clutter."""
-    conf = {"part": f"part/{PART}", "camera": "camera/ensenso_n35", "box": "bin/square_150"}
-    built = {key: load(path) for key, path in (conf | {"physics": "physics/pybullet"}).items()}
-    settings = OmegaConf.load(config_dir() / "generate.yaml")
-    factory = SceneFactory(
-        protocol=Protocol("bench", NUTS, POINTS, {}, drop_step=NUTS),
-        camera_height=settings.camera_height,
-        clutter_spacing=settings.clutter_spacing,
-        seed=0,
-        fingerprint="bench",
-        **built,
-    )
+    part, protocol = load(f"part/{PART}"), Protocol("bench", NUTS, POINTS, {}, drop_step=NUTS)
+    box, physics, clutter = load("bin/square_150"), load("physics/pybullet"), load("clutter/spread")
+    piles = PileFactory(part, protocol, box, physics, clutter, seed=0, fingerprint="bench")
+    views = ViewFactory(part, load("camera/ensenso_n35"), load("view/above"), NoNoise(), POINTS)
+    factory = SceneFactory(piles, views, fingerprint="bench")
     kind = "pile"
     try:
         cycle = factory.make_cycle(CycleTask("train", kind, "L", 0, PART_OBJECT))
@@ -82,13 +79,13 @@ def make_bin() -> NutBin:
         kind = "clutter, as PyBullet is not installed"
         cycle = factory.make_cycle(CycleTask("train", "clutter", "L", 0, PART_OBJECT))
     (scene,) = cycle.scenes
-    mesh = factory.part.mesh(scene.parameters[0])
+    mesh = part.mesh(scene.parameters[0])
     pixels, fine = (
         visible_points(camera, render_view(camera, mesh, scene.R, scene.t))
         for camera in (scene.camera, finer(scene.camera))
     )
     text = (
-        f"{len(scene.R)} nuts {factory.part.name} ({factory.part.text(scene.parameters[0])}), {kind}: "
+        f"{len(scene.R)} nuts {part.name} ({part.text(scene.parameters[0])}), {kind}: "
         f"{len(pixels)} pixels, {len(scene.points)} points"
     )
     return NutBin(scene.points.astype(np.float32), pixels, fine, text)

@@ -18,11 +18,16 @@ from pnet.parts.primitives import Sphere
 from pnet.parts.selection import Keypoint
 from pnet.parts.shapes import Ball
 from pnet.records import Scene, SceneId
-from pnet.scenes.factory import SceneFactory
-from pnet.scenes.pile import Bin
 from pnet.scenes.bullet import BulletPhysics
+from pnet.scenes.clutter import Clutter
+from pnet.scenes.factory import SceneFactory
+from pnet.scenes.noise import NoNoise
+from pnet.scenes.pile import Bin
+from pnet.scenes.pile_factory import PileFactory
 from pnet.scenes.protocol import Protocol, SplitPlan
 from pnet.scenes.store import CycleHeader, write_cycle
+from pnet.scenes.view_factory import ViewFactory
+from pnet.scenes.viewpoints import Viewpoints
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -87,17 +92,11 @@ def factory(tn34: ParametricPart, camera: Camera, box: Bin) -> SceneFactory:
         "val": SplitPlan("L", cycles=1, first_cycle=1, objects=[0]),
     }
     protocol = Protocol("tiny", drop_limit=3, points=256, splits=splits)
-    return SceneFactory(
-        tn34,
-        protocol,
-        camera,
-        box,
-        BulletPhysics(),
-        camera_height=0.65,
-        clutter_spacing=0.6,
-        seed=0,
-        fingerprint="tiny",
+    piles = PileFactory(
+        tn34, protocol, box, BulletPhysics(), Clutter(spacing=0.6), seed=0, fingerprint="tiny"
     )
+    views = ViewFactory(tn34, camera, Viewpoints(), NoNoise(), protocol.points)
+    return SceneFactory(piles, views, fingerprint="tiny")
 
 
 @pytest.fixture(scope="session")

@@ -50,13 +50,14 @@ def snapshot(folder: Path) -> dict[str, bytes]:
 
 def test_generate_made_every_cycle(smoke):
     files = {str(path.relative_to(smoke.data)) for path in smoke.data.rglob("*") if path.is_file()}
-    assert files == {
+    made = {
         "dataset.json",
         *(f"train/{kind}_0000_part_{i:02d}.safetensors" for kind in ("pile", "clutter") for i in (0, 5)),
         "val/pile_0001_part_00.safetensors",
         "test_l/pile_0002_part_00.safetensors",
         "test_g/pile_0000_part_00.safetensors",
     }
+    assert files == made | {f"piles/{name}" for name in made}
     assert json.loads((smoke.data / "dataset.json").read_text())["camera"]["width"] == 160
     out = smoke.outcomes["generate"].out
     assert "7 cycles made, 0 were there" in out and "scenes/s" in out
@@ -313,7 +314,10 @@ def test_a_checkpoint_of_another_backbone_is_not_evaluated(smoke_copy, run_here)
 def test_data_of_other_settings_is_not_mixed(smoke_copy, run_here):
     before = snapshot(smoke_copy.data)
     error = run_here(smoke_copy.folder, "generate", *making(), "workers=0", "seed=1").error
-    assert "seed was 0, now 1" in error and "Choose another data.root" in error
+    assert "piles/dataset.json" in error and "seed was 0, now 1" in error
+    assert "Choose another data.piles" in error
+    error = run_here(smoke_copy.folder, "generate", *making(), "workers=0", "camera.near=0.2").error
+    assert "camera.near was 0.3, now 0.2" in error and "Choose another data.root" in error
     assert snapshot(smoke_copy.data) == before
 
 
@@ -371,14 +375,14 @@ def test_on_a_full_disk_generation_leaves_no_half_file(bullet, run_here, tmp_pat
 
     def full(descriptor):
         calls.append(descriptor)
-        if len(calls) > 3:  # the manifest and two cycles fit
+        if len(calls) > 5:  # two manifests, a cycle's piles and scenes, the next one's piles fit
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         real(descriptor)
 
     monkeypatch.setattr(os, "fsync", full)
     outcome = run_here(tmp_path, "generate", *making(), "workers=0")
     assert outcome.code == 1 and "No space left on device" in outcome.err
-    assert len(list(tmp_path.rglob("*.safetensors"))) == 2 and not left_overs(tmp_path)
+    assert len(list(tmp_path.rglob("*.safetensors"))) == 3 and not left_overs(tmp_path)
 
 
 def test_on_a_full_disk_training_keeps_the_last_checkpoint(smoke_copy, run_here, monkeypatch):

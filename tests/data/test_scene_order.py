@@ -79,5 +79,5 @@ def test_a_kind_that_is_not_there_is_named(kinds, share):
 
 @pytest.mark.parametrize("share", [-0.1, 1.1])
 def test_a_share_outside_its_range_is_refused(share):
-    with pytest.raises(ValueError, match="data.clutter is .*expected a share in"):
+    with pytest.raises(ValueError, match=r"data\.clutter is .*expected a share in"):
         mixed_order(KINDS, 0, share)

@@ -1,6 +1,5 @@
 """Piles by physics: bodies at rest, inside the bin, not inside each other."""
 
-import itertools
 import os
 import subprocess
 import sys
@@ -8,19 +7,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull
 
+from pnet.scenes.bullet import BulletPhysics
+from pnet.scenes.overlap import ConvexPiece, penetration
+from pnet.scenes.physics import Physics, make_body
 from pnet.scenes.pile import Bin
-from pnet.scenes.piling import Physics, collision_pieces, pile_bodies
+from pnet.scenes.piling import POUR_INTERVAL, pile_bodies, pour_bodies, release_above
 
 SRC = Path(__file__).parents[2] / "src"
 HALF_MILLIMETRE = 0.0005
 WIDE = Bin(0.3, 0.3, 0.1)
 
 
-def piles(part, box, drops, seed=0, index=0, **physics):
-    rng = np.random.default_rng(seed)
-    return list(pile_bodies(part, part.part_object("L", index), box, drops, Physics(**physics), rng))
+def piles(part, box, drops, seed=0, index=0, fill=pile_bodies, **physics):
+    rng, physics = np.random.default_rng(seed), BulletPhysics(**physics)
+    return list(fill(part, part.part_object("L", index), box, range(1, drops + 1), physics, rng))
 
 
 def world_corners(part, pile, index=0) -> np.ndarray:
@@ -29,29 +30,11 @@ def world_corners(part, pile, index=0) -> np.ndarray:
     return np.einsum("dij,nj->dni", pile.R, vertices) + pile.t[:, None]
 
 
-def face_normals_and_edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Outward normals and edge directions of a convex hull."""
-    hull = ConvexHull(corners)
-    edges = np.concatenate([np.diff(corners[s[[0, 1, 2, 0]]], axis=0) for s in hull.simplices])
-    edges /= np.linalg.norm(edges, axis=1, keepdims=True)
-    edges *= np.sign(edges @ [1.0, np.e, np.pi])[:, None]
-    return np.unique(hull.equations[:, :3].round(6), axis=0), np.unique(edges.round(6), axis=0)
-
-
-def penetration(a: np.ndarray, b: np.ndarray) -> float:
-    """Least overlap of two convex bodies along all candidate axes; not positive where they are apart."""
-    (na, ea), (nb, eb) = face_normals_and_edges(a), face_normals_and_edges(b)
-    cross = np.cross(ea[:, None], eb[None]).reshape(-1, 3)
-    length = np.linalg.norm(cross, axis=1, keepdims=True)
-    cross = (cross / np.maximum(length, 1e-12))[length[:, 0] > 1e-3]
-    axes = np.concatenate([na, nb, cross, -cross])
-    return float(((a @ axes.T).max(0) - (b @ axes.T).min(0)).min())
-
-
-def test_penetration_of_two_boxes_by_hand():
-    box = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
-    assert penetration(box, box + np.array([0.9, 0.3, 0.2])) == pytest.approx(0.1)
-    assert penetration(box, box + np.array([1.2, 0, 0])) == pytest.approx(-0.2)
+def deepest_overlap(part, pile, index=0) -> float:
+    """How deep the bodies' convex pieces reach into each other, over all pairs of bodies."""
+    pieces = [ConvexPiece(p) for p in part.convex_pieces(part.part_object("L", index), True)]
+    poses = list(zip(pile.R, pile.t, strict=True))
+    return max(penetration(pieces, *pose, poses[i + 1 :]) for i, pose in enumerate(poses[:-1]))
 
 
 @pytest.mark.usefixtures("bullet")
@@ -91,12 +74,7 @@ def test_bodies_do_not_reach_into_each_other(part):
     """In a bin so narrow that eight bodies lie on each other."""
     pile = piles(part, Bin(0.05, 0.05, 0.15), 8)[-1]
     assert len(pile.R) == 8 and pile.t[:, 2].max() > 0.0115  # a flat nut on a flat nut
-    pieces = part.convex_pieces(part.part_object("L", 0), fill_holes=True)
-    placed = [[p @ R.T + t for p in pieces] for R, t in zip(pile.R, pile.t, strict=True)]
-    depth = [
-        penetration(p, q) for a, b in itertools.combinations(placed, 2) for p, q in itertools.product(a, b)
-    ]
-    assert -0.001 < max(depth) < HALF_MILLIMETRE
+    assert -0.001 < deepest_overlap(part, pile) < HALF_MILLIMETRE
 
 
 @pytest.mark.usefixtures("bullet")
@@ -141,7 +119,9 @@ def test_a_pile_that_runs_out_of_time_says_so(tn34, box):
 
 @pytest.mark.usefixtures("bullet")
 def test_an_abandoned_pile_ends_its_simulation(tn34, box):
-    pile = pile_bodies(tn34, tn34.part_object("L", 0), box, 5, Physics(), np.random.default_rng(0))
+    pile = pile_bodies(
+        tn34, tn34.part_object("L", 0), box, range(1, 6), BulletPhysics(), np.random.default_rng(0)
+    )
     next(pile)
     client = pile.gi_frame.f_locals["world"]._client
     assert client.isConnected()
@@ -150,24 +130,10 @@ def test_an_abandoned_pile_ends_its_simulation(tn34, box):
         client.stepSimulation()
 
 
-@pytest.mark.parametrize("collision", ["filled", "exact", "hull"])
-def test_collision_shapes_reach_as_far_as_the_mesh(part, collision):
-    parameters = part.part_object("L", 0)
-    pieces = collision_pieces(part, parameters, collision)
-    corners = np.concatenate(pieces)
-    np.testing.assert_allclose([corners.min(0), corners.max(0)], part.mesh(parameters).bounds, atol=1e-8)
-    assert len(pieces) == 1 if collision == "hull" else len(pieces) >= 1
-
-
 @pytest.mark.usefixtures("bullet")
 def test_a_body_of_exact_pieces_rests_at_the_same_height(tn34):
     filled, exact = (piles(tn34, WIDE, 1, collision=c)[0] for c in ("filled", "exact"))
     assert filled.t[0, 2] == pytest.approx(exact.t[0, 2], abs=HALF_MILLIMETRE)
-
-
-def test_an_unknown_collision_shape_is_refused():
-    with pytest.raises(ValueError, match=r"physics.collision is 'mesh', choose filled, exact or hull"):
-        Physics(collision="mesh")
 
 
 def test_without_the_engine_the_error_names_the_extra(monkeypatch, tn34, box):
@@ -179,8 +145,163 @@ def test_without_the_engine_the_error_names_the_extra(monkeypatch, tn34, box):
 @pytest.mark.usefixtures("bullet")
 def test_connecting_prints_nothing_on_the_screen():
     """In a process of its own: the engine speaks when it is imported first."""
-    script = "from pnet.scenes.piling import connect; connect(); print('done')"
+    script = "from pnet.scenes.bullet import connect; connect(); print('done')"
     done = subprocess.run(
         [sys.executable, "-c", script], env={**os.environ, "PYTHONPATH": str(SRC)}, capture_output=True
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, b"done\n", b"")
+
+
+# poured anew for every number of bodies
+
+
+@pytest.mark.usefixtures("bullet")
+def test_as_many_bodies_are_poured_as_asked(part, box):
+    body, rng = part.part_object("L", 0), np.random.default_rng(0)
+    found = list(pour_bodies(part, body, box, [1, 4, 7], BulletPhysics(), rng))
+    assert [pile.drop for pile in found] == [1, 4, 7] == [len(pile.R) for pile in found]
+    assert all(pile.settled and pile.escaped == 0 for pile in found)
+    for pile in found:
+        corners = world_corners(part, pile)
+        assert abs(corners[..., 2].min()) < HALF_MILLIMETRE
+        assert (np.abs(corners[..., :2]) < box.width / 2 + HALF_MILLIMETRE).all()
+
+
+@pytest.mark.usefixtures("bullet")
+def test_piles_poured_anew_share_no_pose(tn34, box):
+    found = piles(tn34, box, 4, fill=pour_bodies)
+    poses = np.concatenate([np.concatenate([pile.R.reshape(-1, 9), pile.t], 1) for pile in found])
+    assert len(np.unique(poses.round(5), axis=0)) == len(poses) == 1 + 2 + 3 + 4
+
+
+@pytest.mark.usefixtures("bullet")
+def test_bodies_poured_on_each_other_come_to_rest_outside_each_other(part):
+    body, rng = part.part_object("L", 0), np.random.default_rng(1)
+    (pile,) = pour_bodies(part, body, Bin(0.05, 0.05, 0.15), [8], BulletPhysics(), rng)
+    assert pile.settled and len(pile.R) == 8
+    assert -0.001 < deepest_overlap(part, pile) < HALF_MILLIMETRE
+
+
+@pytest.mark.usefixtures("bullet")
+def test_pouring_counts_the_escaped_on_and_says_what_is_not_at_rest(tn34):
+    tiny = Bin(0.02, 0.02, 0.001)
+    found = piles(tn34, tiny, 5, fill=pour_bodies)
+    escaped = [pile.escaped for pile in found]
+    assert escaped == sorted(escaped) and escaped[-1] > 0
+    gone = np.diff([0, *escaped])
+    assert [len(pile.R) + n for pile, n in zip(found, gone, strict=True)] == [1, 2, 3, 4, 5]
+    assert not any(pile.settled for pile in piles(tn34, WIDE, 2, fill=pour_bodies, max_seconds=0.04))
+
+
+@pytest.mark.usefixtures("bullet")
+def test_the_generator_alone_decides_what_is_poured(tn34, box):
+    first, again, other = (piles(tn34, box, 3, seed, fill=pour_bodies)[-1] for seed in (3, 3, 4))
+    assert first.R.tobytes() == again.R.tobytes() and first.t.tobytes() == again.t.tobytes()
+    assert np.abs(first.t - other.t).max() > 1e-3
+
+
+# whatever the engine
+
+
+class NotedWorld:
+    """Notes what is asked of it; bodies stay where they are released, the second one leaves the bin."""
+
+    def __init__(self, calls: list[tuple], limit: int) -> None:
+        self.calls, self.R, self.t = calls, np.zeros((0, 3, 3)), np.zeros((0, 3))
+        self.released = 0
+        calls.append(("world", limit))
+
+    def release(self, R, t):
+        self.released += 1
+        self.calls.append(("release", t.copy()))
+        place = t if self.released != 2 else t + np.array([9.0, 0, 0])
+        self.R, self.t = np.concatenate([self.R, R[None]]), np.concatenate([self.t, place[None]])
+
+    def settle(self, max_seconds):
+        self.calls.append(("settle", max_seconds))
+        return self.released != 3
+
+    def run(self, seconds):
+        self.calls.append(("run", seconds))
+
+    def poses(self):
+        return self.R.copy(), self.t.copy()
+
+    def keep(self, chosen):
+        self.calls.append(("keep", chosen.tolist()))
+        self.R, self.t = self.R[chosen], self.t[chosen]
+
+    def close(self):
+        self.calls.append(("close",))
+
+
+class NotedPhysics(Physics):
+    """The engine of a `NotedWorld`."""
+
+    def __init__(self) -> None:
+        super().__init__(1 / 100, 7.5, 0.01, 0.1, 0.4, 0.02, "hull")
+        object.__setattr__(self, "calls", [])
+
+    def world(self, body, box, limit):
+        return NotedWorld(self.calls, limit)
+
+
+def noted(part, fill, drops) -> tuple[list[tuple], list]:
+    physics, rng = NotedPhysics(), np.random.default_rng(0)
+    return physics.calls, list(fill(part, part.part_object("L", 0), WIDE, drops, physics, rng))
+
+
+def test_a_growing_pile_settles_after_every_body_and_loses_the_escaped(tn34):
+    calls, found = noted(tn34, pile_bodies, [1, 3, 4])
+    assert [call[0] for call in calls] == [
+        *("world", "release", "settle", "release", "settle", "keep"),
+        *("release", "settle", "release", "settle", "close"),
+    ]
+    assert calls[0] == ("world", 4) and ("keep", [True, False]) in calls
+    assert {call[1] for call in calls if call[0] == "settle"} == {7.5}
+    assert [(pile.drop, len(pile.R), pile.escaped) for pile in found] == [(1, 1, 0), (3, 2, 1), (4, 3, 1)]
+    assert [pile.settled for pile in found] == [True, False, True]
+
+
+def test_pouring_lets_bodies_follow_each_other_and_settles_once_a_pile(tn34):
+    calls, found = noted(tn34, pour_bodies, [1, 3])
+    assert [call[0] for call in calls] == [
+        *("world", "release", "run", "settle", "close"),
+        *("world", "release", "run", "release", "run", "release", "run", "settle", "keep", "close"),
+    ]
+    assert [call[1] for call in calls if call[0] == "world"] == [1, 3]
+    assert {call[1] for call in calls if call[0] == "run"} == {POUR_INTERVAL}
+    assert [(pile.drop, len(pile.R), pile.escaped, pile.settled) for pile in found] == [
+        (1, 1, 0, True),
+        (3, 2, 1, False),
+    ]
+
+
+def test_a_body_is_released_over_the_highest_one_within_the_walls(tn34):
+    """The lowest point of its bounding sphere is `drop_height` above the highest body's."""
+    body = make_body(tn34, tn34.part_object("L", 0), "hull")
+    rng, calls = np.random.default_rng(0), []
+    world = NotedWorld(calls, 60)
+    world.released = 2  # nobody leaves
+    for _ in range(40):
+        release_above(world, body, WIDE, 0.02, rng)
+    places = np.array([call[1] for call in calls if call[0] == "release"])
+    gaps = 2 * body.radius + 0.02
+    np.testing.assert_allclose(places[:, 2], body.radius + 0.02 + gaps * np.arange(40))
+    half = 0.15 - body.radius
+    assert (np.abs(places[:, :2]) <= half).all() and np.abs(places[:, :2]).max() > 0.9 * half
+    narrow = NotedWorld([], 1)
+    release_above(narrow, body, Bin(0.001, 0.001, 0.1), 0.02, rng)
+    assert np.abs(narrow.t[:, :2]).max() == 0  # in the middle, where it fits nowhere
+
+
+def test_the_world_is_closed_when_something_fails(tn34, monkeypatch):
+    def broken(*_):
+        raise RuntimeError("no memory")
+
+    monkeypatch.setattr(NotedWorld, "settle", broken)
+    for fill in (pile_bodies, pour_bodies):
+        physics = NotedPhysics()
+        with pytest.raises(RuntimeError, match="no memory"):
+            list(fill(tn34, tn34.part_object("L", 0), WIDE, [1], physics, np.random.default_rng(0)))
+        assert physics.calls[-1] == ("close",)

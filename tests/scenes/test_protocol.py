@@ -8,11 +8,14 @@ from omegaconf import OmegaConf
 from tests.conftest import load_part
 
 from pnet.cli.instantiate import instantiate
+from pnet.parts.base import ParametricPart
 from pnet.parts.spread import spread_order
 from pnet.records import SceneId
 from pnet.scenes.protocol import CycleTask, Protocol, SplitPlan
 
 CONF = Path(__file__).parents[2] / "conf" / "protocol"
+PROTOCOLS = sorted(path.stem for path in CONF.glob("*.yaml"))
+PARTS = sorted(path.stem for path in (CONF.parent / "part").glob("*.yaml"))
 TASK = CycleTask("train", "pile", "L", 3, 5)
 
 
@@ -110,12 +113,74 @@ def test_another_seed_or_part_draws_other_numbers():
     assert len(numbers) == 4
 
 
-def test_splits_draw_different_numbers():
-    """Splits share no cycle of a grid, so no scene of one is a scene of another."""
-    for name in ("paper", "small", "demo", "smoke"):
-        tasks = config(name).tasks({"L": range(12), "G": range(12)})
-        numbers = {t.rng(0, "tn34").random() for t in tasks}
-        assert len(numbers) == len(tasks)
+def test_a_view_draws_other_numbers_than_the_pile_and_than_other_views():
+    numbers = {TASK.rng(0, "tn34", *more).random() for more in ((), *((drop,) for drop in range(61)))}
+    assert len(numbers) == 62
+
+
+def planned(name: str, part: ParametricPart) -> list[CycleTask]:
+    return config(name).tasks({which: spread_order(grid) for which, grid in part.grids.items()})
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_no_two_tasks_of_any_split_draw_the_same_numbers(part):
+    """So no scene of one split is a scene of another, whatever the shipped protocol."""
+    template = load_part(part)
+    for name in PROTOCOLS:
+        tasks = planned(name, template)
+        numbers = {task.rng(0, template.name).random() for task in tasks}
+        assert len(numbers) == len(tasks) > 0, name
+        places = {(task.grid, task.kind, task.cycle, task.part_index) for task in tasks}
+        assert len(places) == len(tasks), name
+
+
+def test_no_two_scenes_of_a_data_set_draw_the_same_numbers(tn34):
+    """Views and noise, beside the piles' own numbers."""
+    tasks, drops = planned("small", tn34), config("small").scene_drops()
+    keys = [(task, more) for task in tasks for more in ((), *((drop,) for drop in drops))]
+    assert len({task.rng(0, "tn34", *more).random() for task, more in keys}) == len(tasks) * 31
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_no_part_object_of_test_g_is_one_that_training_may_see(part):
+    template = load_part(part)
+    for name in PROTOCOLS:
+        tested = {task.part_index for task in planned(name, template) if task.grid == "G"}
+        learnt = template.grids["L"]
+        for index in tested:
+            gap = np.abs(learnt - template.part_object("G", index)).max(1).min()
+            assert gap > 1e-5, (name, index)  # metres; a hundredth of a millimetre is another object
+
+
+def test_only_test_g_uses_the_other_grid():
+    for name in PROTOCOLS:
+        assert all((plan.grid == "G") == (split == "test_g") for split, plan in config(name).splits.items())
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_a_shipped_protocol_says_how_bodies_are_dropped(name):
+    assert config(name).dropping == "one_by_one"
+    assert config(name).name == name
+
+
+@pytest.mark.parametrize("dropping", ["one_by_one", "anew"])
+def test_both_ways_of_dropping_are_taken(dropping):
+    assert Protocol("mine", 3, 16, {}, dropping=dropping).dropping == dropping
+
+
+@pytest.mark.parametrize("dropping", ["", "Anew", "one by one", None])
+def test_another_way_of_dropping_is_refused(dropping):
+    with pytest.raises(
+        ValueError, match=f"protocol mine: dropping is {dropping!r}, choose one_by_one or anew"
+    ):
+        Protocol("mine", 3, 16, {}, dropping=dropping)
+
+
+def test_the_way_of_dropping_changes_no_task():
+    splits = {"train": SplitPlan("L", 2, clutter=0.5)}
+    first, second = (Protocol("mine", 3, 16, splits, dropping=way) for way in ("one_by_one", "anew"))
+    assert first.tasks({"L": range(3)}) == second.tasks({"L": range(3)})
+    assert first.scene_drops() == second.scene_drops() == [1, 2, 3]
 
 
 def test_a_task_names_its_scenes():

@@ -114,8 +114,8 @@ def write_page(path: Path, content: PageContent) -> None:
 
 
 def page_html(content: PageContent) -> str:
-    """The whole page. It carries plotly.js once and loads nothing."""
-    figures = _Figures()
+    """The whole page."""
+    figures = Figures()
     body = "\n".join(
         (
             _head(content),
@@ -125,14 +125,23 @@ def page_html(content: PageContent) -> str:
             _details(content),
         )
     )
+    return document(content.title, body, figures)
+
+
+def document(title: str, body: str, figures: "Figures", style: str = "") -> str:
+    """A page in pnet's looks; it carries plotly.js once and loads nothing.
+
+    Args:
+        title: plain text. body: HTML in which every figure has its place. style: CSS of the page's own.
+    """
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta http-equiv="Content-Security-Policy" content="{_POLICY}">
-<title>{escape(content.title)}</title>
-<style>{_STYLE}</style>
+<title>{escape(title)}</title>
+<style>{_STYLE}{style}</style>
 <script>{get_plotlyjs()}</script>
 </head>
 <body>
@@ -147,7 +156,7 @@ def page_html(content: PageContent) -> str:
 """
 
 
-class _Figures:
+class Figures:
     """Gives every figure its place on the page and draws them all at the end."""
 
     def __init__(self) -> None:
@@ -181,7 +190,7 @@ def _cards(metrics: Sequence[Row]) -> str:
     return "\n".join(('<section class="cards">', *cards, "</section>"))
 
 
-def _scenes(scenes: Sequence[tuple[str, go.Figure]], figures: _Figures) -> str:
+def _scenes(scenes: Sequence[tuple[str, go.Figure]], figures: Figures) -> str:
     if not scenes:
         return ""
     shown = [
@@ -198,7 +207,7 @@ def _scenes(scenes: Sequence[tuple[str, go.Figure]], figures: _Figures) -> str:
     return "\n".join((intro, *shown))
 
 
-def _curves(content: PageContent, figures: _Figures) -> str:
+def _curves(content: PageContent, figures: Figures) -> str:
     shown = [figure for figure in (content.precision_recall, content.training) if figure is not None]
     placed = [f"<figure>{figures.place(figure)}</figure>" for figure in shown]
     intro = (

@@ -30,7 +30,7 @@ class BulletPhysics(Physics):
     """PyBullet's settings.
 
     Attributes:
-        restitution: bounce of every contact.
+        friction, restitution: of every body; a contact has the product of its two.
         rolling_friction: resistance to rolling and spinning, metres times 10; without it a flange on its
             rim rolls on and on. angular_damping: share of turn lost per second.
         solver_iterations: of the contact solver in each step.
@@ -219,7 +219,8 @@ def connect() -> tuple[Any, Any]:
             from pybullet_utils.bullet_client import BulletClient
     except ModuleNotFoundError as missing:
         raise ModuleNotFoundError(
-            "making piles needs PyBullet: install pnet with its extra [sim] (wheels exist for Python 3.11)"
+            "making piles needs PyBullet: install pnet with its extra [sim] (wheels exist for Python 3.11), "
+            "or take physics=mujoco"
         ) from missing
     with _silent():
         return pybullet, BulletClient(pybullet.DIRECT)

@@ -79,7 +79,7 @@ class Physics(ABC):
     Attributes:
         time_step: seconds. max_seconds: simulated time per dropped body after which it counts as unsettled.
         rest_speed: metres per second, rest_turn: radians per second; below both, a body is at rest.
-        friction: Coulomb coefficient of every contact.
+        friction: Coulomb coefficient; engines differ in whether of a contact or of a body.
         drop_height: gap between the pile's top and the next body, metres.
         collision: what stands for a body in contacts, see `make_body`.
     """

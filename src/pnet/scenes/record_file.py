@@ -152,7 +152,8 @@ class RecordFile:
         rows = slice(int(self._first[index]), int(self._first[index + 1]))
         try:
             own = {name: view[index : index + 1] for name, view in self._own.items()}
-            bodies = {name: view[rows] for name, view in self._bodies.items()}
+            none = rows.start == rows.stop  # at an array's end safetensors refuses to slice nothing
+            bodies = {n: self._file.get_tensor(n)[:0] if none else v[rows] for n, v in self._bodies.items()}
         except (SafetensorError, ValueError, IndexError, OverflowError) as fault:
             raise self._form.damaged(self.path, f"scene {index}: {fault}") from fault
         if _digest([*own.values(), *bodies.values()]) != self._crc32[index]:
