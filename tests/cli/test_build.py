@@ -20,10 +20,10 @@ from pnet.cli.build import share
 )
 def test_a_share_may_be_a_fraction(value, expected):
     """Whether it lies in (0, 1] the data module says."""
-    assert share(value) == expected and isinstance(share(value), float)
+    assert share("data.learn", value) == expected and isinstance(share("data.learn", value), float)
 
 
 @pytest.mark.parametrize("value", ["a third", "", "1/0", "1/3/5", None, True, "nan", "inf", [1, 3]])
 def test_what_is_no_share_is_refused(value):
-    with pytest.raises(ValueError, match=r"data\.learn is .*, expected a share in .*, for instance 1/3"):
-        share(value)
+    with pytest.raises(ValueError, match=r"data\.learn is .*, expected a share, for instance 1/3"):
+        share("data.learn", value)

@@ -321,6 +321,73 @@ def test_data_of_other_settings_is_not_mixed(smoke_copy, run_here):
     assert snapshot(smoke_copy.data) == before
 
 
+# two stages, several machines
+
+
+def test_stages_and_shards_together_make_the_same_data(smoke, run_here, tmp_path, monkeypatch):
+    """Piles first; then two machines render a half each, without a physics engine."""
+    data, whole = tmp_path / "outputs" / "data" / "tn34_smoke", snapshot(smoke.data)
+    error = run_here(tmp_path, "generate", *making(), "stage=render").error
+    assert "piles/dataset.json: no data set there; run pnet-generate stage=simulate first" in error
+    assert not list(tmp_path.rglob("*.json"))
+    outcome = run_here(tmp_path, "generate", *making(), "workers=0", "stage=simulate")
+    assert "7 cycles made, 0 were there; piles in" in outcome.out and "scenes/s" in outcome.out
+    piles = {name: content for name, content in whole.items() if name.startswith("piles/")}
+    assert finished(data) == piles
+
+    monkeypatch.setattr("pnet.scenes.bullet.connect", None)
+    made = 0
+    for shard, cycles in (("1/2", 4), ("2/2", 3)):
+        outcome = run_here(tmp_path, "generate", *making(), "workers=0", "stage=render", f"shard={shard}")
+        assert f"{cycles} cycles made, 0 were there; data set in" in outcome.out, outcome
+        made += cycles
+        assert len(finished(data)) == len(piles) + 1 + made
+    assert finished(data) == whole
+
+
+def finished(folder: Path) -> dict[str, bytes]:
+    """The files without locks."""
+    return {name: content for name, content in snapshot(folder).items() if not name.endswith(".lock")}
+
+
+def test_another_sets_piles_are_rendered_again_and_stay_as_they_are(smoke, run_here, tmp_path, monkeypatch):
+    monkeypatch.setattr("pnet.scenes.bullet.connect", None)
+    before = snapshot(smoke.data)
+    again = (
+        *making(),
+        "workers=0",
+        "data.root=near",
+        f"data.piles={smoke.data}/piles",
+        "view.distance=[0.6,0.6]",
+    )
+    outcome = run_here(tmp_path, "generate", *again)
+    assert outcome.code == 0 and "the piles of 7 of these cycles were there" in outcome.out
+    scenes, others = SceneFolder(tmp_path / "near", "train", "tn34"), SceneFolder(smoke.data, "train", "tn34")
+    np.testing.assert_allclose(others[0].t - scenes[0].t, [[0, 0, 0.05]], atol=1e-12)
+    assert snapshot(smoke.data) == before and not (tmp_path / "near" / "piles").exists()
+    error = run_here(tmp_path, "generate", *again, "clutter.spacing=0.7").error
+    assert "clutter.spacing was 0.8, now 0.7" in error and "Choose another data.piles" in error
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("stage=both",), "stage=both: choose simulate, render, all"),
+        (("shard=3/2",), "shard=3/2: expected a number and a count, from 1/8 to 8/8"),
+        (("shard=2",), "shard=2: expected a number and a count"),
+        (("noise_in=[train,test]",), "noise_in holds 'test', choose from train, val, test_l, test_g"),
+        (("protocol.dropping=twice",), "dropping is 'twice', choose one_by_one or anew"),
+        (("physics.collision=mesh",), "physics.collision is 'mesh', choose filled, exact, hull"),
+        (("view.tilt=[30,10]",), "view.tilt is [30, 10], expected [smallest, largest]"),
+        (("clutter.density=0",), "clutter.density is 0, expected more than 0"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, tuple) else "",
+)
+def test_generation_refuses_and_writes_nothing(run_here, tmp_path, overrides, message):
+    assert message in run_here(tmp_path, "generate", *making(), "workers=0", *overrides).error
+    assert not list(tmp_path.iterdir())
+
+
 def test_predictions_of_other_data_are_refused(smoke_copy, run_here):
     manifest = smoke_copy.data / "dataset.json"
     manifest.write_text(manifest.read_text().replace('"seed": 0', '"seed": 1'))
@@ -370,7 +437,7 @@ def test_on_a_full_disk_an_evaluation_keeps_what_was_there(smoke_copy, run_here,
     assert snapshot(smoke_copy.folder) == before
 
 
-def test_on_a_full_disk_generation_leaves_no_half_file(bullet, run_here, tmp_path, monkeypatch):
+def test_on_a_full_disk_generation_loses_nothing(smoke, run_here, tmp_path, monkeypatch):
     real, calls = os.fsync, []
 
     def full(descriptor):
@@ -379,10 +446,14 @@ def test_on_a_full_disk_generation_leaves_no_half_file(bullet, run_here, tmp_pat
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         real(descriptor)
 
-    monkeypatch.setattr(os, "fsync", full)
-    outcome = run_here(tmp_path, "generate", *making(), "workers=0")
-    assert outcome.code == 1 and "No space left on device" in outcome.err
-    assert len(list(tmp_path.rglob("*.safetensors"))) == 3 and not left_overs(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        error = run_here(tmp_path, "generate", *making(), "workers=0").error
+    assert "No space left on device" in error
+    data, whole = tmp_path / "outputs" / "data" / "tn34_smoke", snapshot(smoke.data)
+    assert len(list(data.rglob("*.safetensors"))) == 3 and snapshot(data).items() <= whole.items()
+    assert run_here(tmp_path, "generate", *making(), "workers=0").code == 0
+    assert snapshot(data) == whole
 
 
 def test_on_a_full_disk_training_keeps_the_last_checkpoint(smoke_copy, run_here, monkeypatch):

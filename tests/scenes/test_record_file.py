@@ -206,6 +206,17 @@ def test_every_digit_of_the_header_counts(path, whole):
         assert is_refused(path), whole[place - 20 : place + 20]
 
 
+@pytest.mark.parametrize("first", [[0, 3, 2, 5], [0, 2, 2, 6], [-1, 2, 2, 5], [0, 2, 2, 2**62]])
+def test_places_of_bodies_that_make_no_sense_are_refused_before_a_record_is_read(path, whole, first):
+    start = 8 + int.from_bytes(whole[:8], "little")
+    begin, end = json.loads(whole[8:start])["first_body"]["data_offsets"]
+    right, wrong = (np.array(values, np.int64).tobytes() for values in ([0, 2, 2, 5], first))
+    assert whole[start + begin : start + end] == right
+    path.write_bytes(whole[: start + begin] + wrong + whole[start + end :])
+    with pytest.raises(ValueError, match=f"{path}: not a whole shelf file .record or body counts disagree"):
+        RecordFile(path, SHELF)
+
+
 @pytest.mark.parametrize(
     ("old", "new"), [("F64", "I64"), ("F32", "I32"), ("I64", "U64"), ("I16", "U16"), ("U8", "I8")]
 )
@@ -272,6 +283,18 @@ def test_a_missing_file_is_named_with_its_remedy(path):
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read anything")
 def test_a_file_that_may_not_be_read_is_named(path, whole):
     path.chmod(0)
+    with pytest.raises(PermissionError, match=f"{path}: not allowed to read it"):
+        RecordFile(path, SHELF)
+
+
+@pytest.mark.parametrize("fault", [FileNotFoundError, PermissionError])
+def test_a_file_that_is_there_is_never_called_missing(path, whole, monkeypatch, fault):
+    """What safetensors raises of a file that may not be read depends on its version."""
+
+    def refuse(*_, **__):
+        raise fault(f"No such file or directory: {path}")
+
+    monkeypatch.setattr("pnet.scenes.record_file.safe_open", refuse)
     with pytest.raises(PermissionError, match=f"{path}: not allowed to read it"):
         RecordFile(path, SHELF)
 

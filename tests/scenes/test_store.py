@@ -126,7 +126,7 @@ def test_a_scene_of_another_checksum_is_refused_and_the_others_are_read(path, wh
     path.write_bytes(edit_header(whole, crc32=[crc32[0], crc32[1] ^ 1, crc32[2]]))
     file = CycleFile(path)
     np.testing.assert_array_equal(file.scene(2).points, SCENES[2].points)
-    with pytest.raises(ValueError, match=f"{path}: not a whole cycle file .scene 1 does not match"):
+    with pytest.raises(ValueError, match=f"{path}: not a whole cycle file .record 1 does not match"):
         file.scene(1)
 
 

@@ -69,15 +69,18 @@ def take_share(tasks: list["CycleTask"], shard: str | None) -> list["CycleTask"]
 
 def open_folders(cfg: DictConfig, plan: "Plan", tasks: list["CycleTask"]) -> None:
     """Create the folders of the stages with their manifests, or check the manifests that are there."""
-    from pnet.scenes.generation import open_root
+    from pnet.scenes.generation import check_root, open_root
     from pnet.scenes.manifest import read_manifest
 
-    piles = manifest_of(piling_settings(making_settings(cfg)), tasks)
+    settings = making_settings(cfg)
+    piles, scenes = (manifest_of(part, tasks) for part in (piling_settings(settings), settings))
     if plan.stage == "render":
         read_manifest(plan.piles, "run pnet-generate stage=simulate first, or name another data.piles")
+    if plan.stage != "simulate":
+        check_root(plan.scenes, scenes)  # before anything is written
     open_root(plan.piles, piles, "data.piles")
     if plan.stage != "simulate":
-        open_root(plan.scenes, manifest_of(making_settings(cfg), tasks))
+        open_root(plan.scenes, scenes)
 
 
 def make_missing(cfg: DictConfig, plan: "Plan", tasks: list["CycleTask"]) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from time import perf_counter
 
 from pnet.records import Scene
@@ -45,6 +46,10 @@ class SceneFactory:
     fingerprint: str
     noise_in: Sequence[str] = SPLITS
 
+    @cached_property
+    def _exact_views(self) -> ViewFactory:
+        return replace(self.views, noise=NoNoise())
+
     def make_cycle(self, task: CycleTask) -> Cycle:
         """Make one cycle; a pure function of the settings and the task."""
         start = perf_counter()
@@ -56,7 +61,7 @@ class SceneFactory:
 
     def render_cycle(self, task: CycleTask, made: PileHeader, piles: Sequence[Pile]) -> Cycle:
         """The scenes of a cycle whose piles are there."""
-        views = self.views if task.split in self.noise_in else replace(self.views, noise=NoNoise())
+        views = self.views if task.split in self.noise_in else self._exact_views
         times, scenes = StageTimes(), []
         for pile in piles:
             rng = task.rng(self.piles.seed, made.part, pile.drop)

@@ -109,6 +109,10 @@ class Plan:
             write_piles(path, *made)
             times.simulate, times.write = simulated - start, perf_counter() - simulated
         file = PileFile(path)
+        if file.header.fingerprint != self.factory.piles.fingerprint:
+            raise ValueError(
+                f"{path}: its piles were made with other settings; delete it and run stage=simulate"
+            )
         piles = [file.pile(i) for i in range(len(file))]  # as they are read: so stages agree to the bit
         if self.stage == "simulate":
             unsettled = sum(not pile.settled for pile in piles)
@@ -132,8 +136,8 @@ def cycle_path(root: Path, task: CycleTask) -> Path:
     return root / task.split / (task.scene_id(0).file_stem + SUFFIX)
 
 
-def open_root(root: Path, settings: Mapping[str, Any], key: str = "data.root") -> None:
-    """Create a data folder and its manifest, or check that the one there was made with these settings.
+def check_root(root: Path, settings: Mapping[str, Any], key: str = "data.root") -> None:
+    """Check that a data folder, where it is there, was made with these settings.
 
     Args:
         key: the setting that names the folder, for messages.
@@ -141,15 +145,19 @@ def open_root(root: Path, settings: Mapping[str, Any], key: str = "data.root") -
         ValueError: where other settings made it; names the first few that differ.
     """
     manifest = root / MANIFEST
-    if manifest.exists():
-        found = read_manifest(root)
-        differing = sorted(differences(found, settings))
-        if differing:
-            raise ValueError(
-                f"{manifest}: this data was made with other settings: {'; '.join(differing[:4])}. "
-                f"Choose another {key}, or delete this folder to make it anew"
-            )
-    else:
+    differing = sorted(differences(read_manifest(root), settings)) if manifest.exists() else []
+    if differing:
+        raise ValueError(
+            f"{manifest}: this data was made with other settings: {'; '.join(differing[:4])}. "
+            f"Choose another {key}, or delete this folder to make it anew"
+        )
+
+
+def open_root(root: Path, settings: Mapping[str, Any], key: str = "data.root") -> None:
+    """Create a data folder and its manifest, or check the one there. Arguments and errors as `check_root`."""
+    check_root(root, settings, key)
+    manifest = root / MANIFEST
+    if not manifest.exists():
         root.mkdir(parents=True, exist_ok=True)
         write_atomically(manifest, (json.dumps(settings, indent=1, sort_keys=True) + "\n").encode())
     remove_left_overs(root)

@@ -64,7 +64,7 @@ def write_records(
     counts = [len(record[next(iter(form.bodies))]) for record in records]
     first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     arrays: dict[str, NDArray[Any]] = {FIRST_BODY: first}
-    present = {k: v for k, v in form.optional.items() if records and k in records[0]}
+    present = {k: v for k, v in form.optional.items() if records and all(k in record for record in records)}
     for name, kind in {**form.own, **present}.items():
         arrays[name] = np.stack([r[name] for r in records]) if records else np.zeros(0)
         arrays[name] = arrays[name].astype(_TYPES[kind])
@@ -108,10 +108,10 @@ class RecordFile:
             newer = version > form.version
             if version == form.version:
                 self._check()
-        except FileNotFoundError:
+        except (FileNotFoundError, PermissionError) as fault:  # safetensors raises the first for both
+            if path.exists():
+                raise PermissionError(f"{path}: not allowed to read it") from fault
             raise FileNotFoundError(f"{path}: no such {form.what} file; {form.remedy}") from None
-        except PermissionError as fault:
-            raise PermissionError(f"{path}: not allowed to read it") from fault
         except _FAULTS as fault:
             raise form.damaged(path, str(fault)) from fault
         if version != form.version:
@@ -155,9 +155,9 @@ class RecordFile:
             none = rows.start == rows.stop  # at an array's end safetensors refuses to slice nothing
             bodies = {n: self._file.get_tensor(n)[:0] if none else v[rows] for n, v in self._bodies.items()}
         except (SafetensorError, ValueError, IndexError, OverflowError) as fault:
-            raise self._form.damaged(self.path, f"scene {index}: {fault}") from fault
+            raise self._form.damaged(self.path, f"record {index}: {fault}") from fault
         if _digest([*own.values(), *bodies.values()]) != self._crc32[index]:
-            raise self._form.damaged(self.path, f"scene {index} does not match its checksum")
+            raise self._form.damaged(self.path, f"record {index} does not match its checksum")
         return {**{name: array[0] for name, array in own.items()}, **bodies}
 
 

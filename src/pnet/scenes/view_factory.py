@@ -4,18 +4,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 from pnet.geometry.camera import Camera
 from pnet.ops.sampling import farthest_point_order
 from pnet.parts.base import ParametricPart
 from pnet.records import Scene, SceneId
 from pnet.scenes.edges import image_edges
-from pnet.scenes.noise import NoNoise, SensorNoise
+from pnet.scenes.noise import SensorNoise
 from pnet.scenes.pile import Pile
-from pnet.scenes.rendering import render_view
+from pnet.scenes.rendering import View, render_view
 from pnet.scenes.viewpoints import Viewpoints
 
 EDGE_STEP = 0.003  # neighbouring pixels whose depths differ by more have an edge between them, metres
@@ -64,24 +66,13 @@ class ViewFactory:
         image = render_view(self.camera, self._mesh(tuple(parameters)), R, t)
         rendered = perf_counter()
         times.render += rendered - start
-        pixels = np.flatnonzero(image.instance >= 0)
-        if not len(pixels):
+        measured = self._measure(image, rng)
+        if not len(measured["points"]):
             return None
-        v, u = np.divmod(pixels, self.camera.width)
-        depth = image.depth.reshape(-1)[pixels, None]
-        cloud = (self.camera.rays(u, v) * depth).astype(np.float32)
-        incidence = np.rint(255 * image.incidence.reshape(-1)[pixels]).astype(np.uint8)
-        edge = image_edges(image.depth, EDGE_STEP).reshape(-1)[pixels]
-        if not isinstance(self.noise, NoNoise):
-            cloud, kept = self.noise(cloud, incidence / 255, edge, self.camera, rng)
-            cloud, pixels, incidence, edge = cloud[kept], pixels[kept], incidence[kept], edge[kept]
-            if not len(pixels):
-                return None
-        order = farthest_point_order(cloud, self.points)
+        order = farthest_point_order(measured["points"], self.points)
         times.sample += perf_counter() - rendered
         return Scene(
-            points=cloud[order],
-            instance=image.instance.reshape(-1)[pixels[order]],
+            **{name: values[order] for name, values in measured.items()},
             R=R,
             t=t,
             parameters=np.tile(np.array(parameters), (len(R), 1)),
@@ -90,9 +81,19 @@ class ViewFactory:
             camera=self.camera,
             part=self.part.name,
             id=scene_id,
-            incidence=incidence[order],
-            edge=edge[order],
         )
+
+    def _measure(self, image: View, rng: np.random.Generator) -> dict[str, NDArray[Any]]:
+        """The pixels on bodies as the sensor measures them, as the arrays of a `Scene`."""
+        pixels = np.flatnonzero(image.instance >= 0)
+        v, u = np.divmod(pixels, self.camera.width)
+        cloud = (self.camera.rays(u, v) * image.depth.reshape(-1)[pixels, None]).astype(np.float32)
+        incidence = np.rint(255 * image.incidence.reshape(-1)[pixels]).astype(np.uint8)
+        edge = image_edges(image.depth, EDGE_STEP).reshape(-1)[pixels]
+        cloud, kept = self.noise(cloud, incidence / 255, edge, self.camera, rng)
+        found: dict[str, NDArray[Any]] = {"points": cloud, "incidence": incidence, "edge": edge}
+        found["instance"] = image.instance.reshape(-1)[pixels]
+        return {name: values[kept] for name, values in found.items()}
 
     @lru_cache(maxsize=256)  # noqa: B019  as long-lived as its process
     def _mesh(self, parameters: tuple[float, ...]) -> trimesh.Trimesh:
