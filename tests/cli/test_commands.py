@@ -314,8 +314,8 @@ def test_a_checkpoint_of_another_backbone_is_not_evaluated(smoke_copy, run_here)
 def test_data_of_other_settings_is_not_mixed(smoke_copy, run_here):
     before = snapshot(smoke_copy.data)
     error = run_here(smoke_copy.folder, "generate", *making(), "workers=0", "seed=1").error
-    assert "piles/dataset.json" in error and "seed was 0, now 1" in error
-    assert "Choose another data.piles" in error
+    assert "tn34_smoke/dataset.json" in error and "seed was 0, now 1" in error
+    assert "Choose another data.root" in error
     error = run_here(smoke_copy.folder, "generate", *making(), "workers=0", "camera.near=0.2").error
     assert "camera.near was 0.3, now 0.2" in error and "Choose another data.root" in error
     assert snapshot(smoke_copy.data) == before
@@ -365,7 +365,7 @@ def test_another_sets_piles_are_rendered_again_and_stay_as_they_are(smoke, run_h
     scenes, others = SceneFolder(tmp_path / "near", "train", "tn34"), SceneFolder(smoke.data, "train", "tn34")
     np.testing.assert_allclose(others[0].t - scenes[0].t, [[0, 0, 0.05]], atol=1e-12)
     assert snapshot(smoke.data) == before and not (tmp_path / "near" / "piles").exists()
-    error = run_here(tmp_path, "generate", *again, "clutter.spacing=0.7").error
+    error = run_here(tmp_path, "generate", *again, "data.root=other", "clutter.spacing=0.7").error
     assert "clutter.spacing was 0.8, now 0.7" in error and "Choose another data.piles" in error
 
 
@@ -375,7 +375,19 @@ def test_another_sets_piles_are_rendered_again_and_stay_as_they_are(smoke, run_h
         (("stage=both",), "stage=both: choose simulate, render, all"),
         (("shard=3/2",), "shard=3/2: expected a number and a count, from 1/8 to 8/8"),
         (("shard=2",), "shard=2: expected a number and a count"),
-        (("noise_in=[train,test]",), "noise_in holds 'test', choose from train, val, test_l, test_g"),
+        (("noise_in=[train,test]",), "noise_in is ['train', 'test'], expected a list out of train, val"),
+        (("noise_in=train",), "noise_in is train, expected a list out of train, val"),
+        (("noise_in=null",), "noise_in is None, expected a list"),
+        (("seed=-1",), "seed is -1, expected at least 0"),
+        (("workers=abc",), "workers is 'abc', expected at least 0"),
+        (("view.distance=0.65",), "view.distance is 0.65, expected [smallest, largest]"),
+        (("clutter.spacing=abc",), "clutter.spacing is 'abc', expected at least 0"),
+        (("noise=gaussian", "noise.sigma=null"), "noise.sigma is None, expected at least 0"),
+        (("data.root=one", "data.piles=one"), "data.piles and data.root are both one"),
+        (
+            ("protocol=paper", "part=tless20", "protocol.drop_limit=5"),
+            "for tless20 this protocol has its own; set protocol.by_part.tless20.drop_limit",
+        ),
         (("protocol.dropping=twice",), "dropping is 'twice', choose one_by_one or anew"),
         (("physics.collision=mesh",), "physics.collision is 'mesh', choose filled, exact, hull"),
         (("view.tilt=[30,10]",), "view.tilt is [30, 10], expected [smallest, largest]"),
@@ -386,6 +398,54 @@ def test_another_sets_piles_are_rendered_again_and_stay_as_they_are(smoke, run_h
 def test_generation_refuses_and_writes_nothing(run_here, tmp_path, overrides, message):
     assert message in run_here(tmp_path, "generate", *making(), "workers=0", *overrides).error
     assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_of_scenes_is_not_taken_for_piles(smoke, run_here, tmp_path):
+    before = snapshot(smoke.data)
+    arguments = (*making(), "workers=0", "data.root=near", f"data.piles={smoke.data}")
+    error = run_here(tmp_path, "generate", *arguments).error
+    assert f"holds scenes; its piles are in {smoke.data}/piles" in error
+    assert snapshot(smoke.data) == before and not (tmp_path / "near").exists()
+
+
+def test_rendering_does_not_begin_where_piles_are_missing(smoke_copy, run_here):
+    shutil.rmtree(smoke_copy.data / "train")
+    gone = sorted((smoke_copy.data / "piles" / "train").iterdir())[:2]
+    for path in gone:
+        path.unlink()
+    error = run_here(smoke_copy.folder, "generate", *making(), "workers=0", "stage=render").error
+    assert f"{gone[0].name}: no such pile file, and 1 more are missing; run pnet-generate" in error
+    assert not list((smoke_copy.data / "train").glob("*"))
+
+
+def test_piles_of_other_settings_are_not_rendered(smoke_copy, run_here):
+    """Another cycle's file in a cycle's place: whole, and yet not what it says."""
+    one, other = sorted((smoke_copy.data / "piles" / "train").glob("pile*"))[:2]
+    shutil.copy(other, one)
+    (smoke_copy.data / "train" / one.name).unlink()
+    error = run_here(smoke_copy.folder, "generate", *making(), "workers=0", "stage=render").error
+    assert f"{one.name}: made with other settings; delete it and run stage=simulate" in error
+
+
+def test_the_settings_of_another_set_leave_nothing_to_choose(smoke, run_here, tmp_path):
+    like = f"like={smoke.data}/dataset.json"
+    error = run_here(tmp_path, "generate", like, "data.root=again", "seed=3").error
+    assert error.startswith("seed has no say beside like=")
+    assert "say with data.root= where" in run_here(tmp_path, "generate", like).error
+    old = json.loads((smoke.data / "dataset.json").read_text())
+    del old["view"]
+    (tmp_path / "old.json").write_text(json.dumps(old))
+    error = run_here(tmp_path, "generate", "like=old.json", "data.root=again").error
+    assert "old.json: made by an older pnet, it lacks 'view'; make the data anew" in error
+
+
+def test_noise_is_not_added_twice(smoke_copy, run_here):
+    """Scenes that were measured by a noisy sensor are not sent through another one."""
+    noisy = ("noise=gaussian", "data.root=noisy", f"data.piles={smoke_copy.data}/piles", "workers=0")
+    assert run_here(smoke_copy.folder, "generate", *making(), *noisy).code == 0
+    train = (*TRAIN, "noise=gaussian", "data.root=noisy", "run_dir=outputs/twice")
+    error = run_here(smoke_copy.folder, "train", *train).error
+    assert "noisy: its scenes for training have a noise already; train with noise=none" in error
 
 
 def test_predictions_of_other_data_are_refused(smoke_copy, run_here):
@@ -449,7 +509,7 @@ def test_on_a_full_disk_generation_loses_nothing(smoke, run_here, tmp_path, monk
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
         error = run_here(tmp_path, "generate", *making(), "workers=0").error
-    assert "No space left on device" in error
+    assert "No space left on device" in error and ".safetensors" in error
     data, whole = tmp_path / "outputs" / "data" / "tn34_smoke", snapshot(smoke.data)
     assert len(list(data.rglob("*.safetensors"))) == 3 and snapshot(data).items() <= whole.items()
     assert run_here(tmp_path, "generate", *making(), "workers=0").code == 0

@@ -173,7 +173,7 @@ def test_mistakes_are_told_in_one_line(made, run_here, arguments, error):
         (lambda text: b"[]", "dataset.json: not a data set's manifest"),
         (
             lambda text: b'{"a": 1}',
-            "dataset.json: no manifest of this pnet's data sets, it lacks part",
+            "dataset.json: made by an older pnet, it lacks part",
         ),
         (
             lambda text: text.replace(b"tn34.TN34", b"tn34.TN99"),

@@ -25,7 +25,8 @@ def row_of(size: int, seed: int, draws: int | None = None, rank: int = 0, world:
 def epoch(sampler: EpochSampler, number: int) -> list[int]:
     sampler.set_epoch(number)
     draws = list(sampler)
-    assert {e for _, e in draws} <= {number}
+    places = [place for _, place in draws]
+    assert len(set(places)) == len(places)  # chance depends on them
     return [index for index, _ in draws]
 
 
@@ -149,10 +150,15 @@ def test_without_draws_each_process_takes_as_many_as_there_are_scenes():
     assert Counter(index for part in each for index in part) == dict.fromkeys(range(5), 3)
 
 
-def test_the_draws_say_their_epoch_to_every_process():
-    sampler = row_of(6, 0, 4, rank=1, world=2)
-    sampler.set_epoch(3)
-    assert [number for _, number in sampler] == [3] * 4
+def test_the_draws_of_all_processes_and_epochs_say_different_places():
+    """So that view, noise and augmentation never repeat, however often a scene comes."""
+    places = []
+    for number in range(3):
+        for rank in range(2):
+            sampler = row_of(6, 0, 8, rank, 2)
+            sampler.set_epoch(number)
+            places += [place for _, place in sampler]
+    assert sorted(places) == list(range(48))
 
 
 def test_the_order_of_one_process_is_as_it_was():

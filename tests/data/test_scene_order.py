@@ -29,23 +29,33 @@ def test_streams_of_one_seed_differ():
     assert [first[i] for i in range(50)] != [second[i] for i in range(50)]
 
 
-@given(share=st.fractions(0, 1, max_denominator=60), length=st.integers(1, 300))
-def test_a_mixture_keeps_its_share_at_any_length(share, length):
-    mixed = Mixture(Permutations([0], 0), Permutations([1], 0), float(share))
-    assert sum(mixed[i] for i in range(length)) == int(length * share)
+@given(share=st.fractions(0, 1, max_denominator=60), block=st.integers(0, 9), seed=st.integers(0, 3))
+def test_a_mixture_keeps_its_share_in_every_block(share, block, seed):
+    mixed = Mixture(Permutations([0], 0), Permutations([1], 0), float(share), seed)
+    n = share.denominator
+    assert sum(mixed[block * n + i] for i in range(n)) == share.numerator
+
+
+@pytest.mark.parametrize(("share", "world"), [(0.5, 2), (0.25, 4), (0.6, 5)])
+def test_every_process_of_several_sees_the_share(share, world):
+    mixed = Mixture(Permutations([0], 0), Permutations([1], 0), share, 0)
+    for rank in range(world):
+        seen = [mixed[i] for i in range(rank, 4000, world)]
+        assert np.mean(seen) == pytest.approx(share, abs=0.1)
 
 
 @given(share=st.sampled_from([0.25, 0.6, 0.9]), a=st.integers(1, 7), b=st.integers(1, 7))
 def test_a_mixture_goes_through_both_orders_in_turn(share, a, b):
     first, second = Permutations(range(a), 1, 0), Permutations(range(a, a + b), 1, 1)
-    row = [Mixture(first, second, share)[i] for i in range(200)]
+    mixed = Mixture(first, second, share, 0)
+    row = [mixed[i] for i in range(200)]
     for order, scenes in ((first, range(a)), (second, range(a, a + b))):
         own = [i for i in row if i in scenes]
         assert own == [order[i] for i in range(len(own))]
 
 
 def test_a_mixture_does_not_lose_its_share_far_out():
-    mixed = Mixture(Permutations([0], 0), Permutations([1], 0), 0.3)
+    mixed = Mixture(Permutations([0], 0), Permutations([1], 0), 0.3, 0)
     far = 10**15
     assert sum(mixed[far + i] for i in range(1000)) == 300
 

@@ -14,7 +14,7 @@ from pnet.scenes.pile import Bin, Pile
 from pnet.scenes.pile_store import PileFile, write_piles
 from pnet.scenes.protocol import SPLITS, CycleTask, Protocol, SplitPlan
 from pnet.scenes.rendering import render_view
-from pnet.scenes.view_factory import EDGE_STEP, ViewFactory
+from pnet.scenes.view_factory import EDGE_SLOPE, ViewFactory
 from pnet.scenes.viewpoints import Viewpoints
 
 PILE = CycleTask("train", "pile", "L", 0, 5)
@@ -263,8 +263,9 @@ def test_edges_are_at_silhouettes_and_jumps_of_the_depth(nut_views):
     mesh = nut_views.part.mesh(scene.parameters[0])
     depth = render_view(nut_views.camera, mesh, scene.R, scene.t).depth
     u, v = np.rint(nut_views.camera.project(scene.points.astype(float))).astype(int).T
+    step = EDGE_SLOPE * depth[depth > 0].mean() / nut_views.camera.fx
     jumps = [
-        (depth[v + dv, u + du] == 0) | (np.abs(depth[v + dv, u + du] - depth[v, u]) > EDGE_STEP)
+        (depth[v + dv, u + du] == 0) | (np.abs(depth[v + dv, u + du] - depth[v, u]) > step)
         for du, dv in ((1, 0), (-1, 0), (0, 1), (0, -1))
     ]
     np.testing.assert_array_equal(scene.edge == 0, np.any(jumps, axis=0))

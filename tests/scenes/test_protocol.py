@@ -27,6 +27,38 @@ def config(name: str) -> Protocol:
     return instantiate(OmegaConf.load(CONF / f"{name}.yaml"))
 
 
+@pytest.mark.parametrize(
+    ("part", "drop_limit"), [("candlestick", 60), ("gear", 60), ("tless20", 99), ("tless29", 79)]
+)
+def test_the_paper_has_sileanes_own_numbers(part, drop_limit):
+    """Table I: 500 cycles to learn from (one of them for validation), two to test, no G."""
+    plan = config("paper").for_part(part)
+    assert plan.drop_limit == plan.scene_drops()[-1] == drop_limit and plan.points == 16_384
+    cycles = {split: (p.first_cycle, p.cycles) for split, p in plan.splits.items()}
+    assert cycles == {"train": (0, 499), "val": (499, 1), "test_l": (500, 2)}
+    assert len(plan.tasks({"L": [0]})) == 502
+
+
+def test_what_cannot_differ_by_part_is_named():
+    with pytest.raises(ValueError, match=r"protocol x, by_part\.tn34: points cannot differ by part"):
+        Protocol("x", 3, 10, {}, by_part={"tn34": {"points": 3}})
+
+
+def test_a_part_without_numbers_of_its_own_has_the_plans():
+    plan = config("paper")
+    assert plan.for_part("tn06") is plan and plan.for_part("tn06").drop_limit == 60
+
+
+def test_the_real_world_has_60_part_objects_to_learn_and_4_unseen():
+    """Section III.C: 28,800 scenes and 1,920."""
+    plan = config("real_world")
+    tasks = plan.tasks({"L": range(64), "G": range(64)})
+    scenes = {split: 16 * sum(task.split == split for task in tasks) for split in plan.splits}
+    assert scenes == {"train": 29 * 60 * 16, "val": 60 * 16, "test_g": 1920}
+    assert scenes["train"] + scenes["val"] == 28_800
+    assert plan.scene_drops() == list(range(1, 17))
+
+
 @pytest.mark.parametrize("objects", [64, 16])
 def test_the_paper_has_29_cycles_to_learn_from_and_one_for_each_test(objects):
     """Table I: 64 part objects of TN06, 16 of TN34, 60 drops, 29 + 1 + 1 cycles."""

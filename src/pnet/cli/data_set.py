@@ -11,7 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from pnet.cli.app import config_flags, hydra_value, key_of
-from pnet.cli.settings import METRICS, read_run
+from pnet.cli.settings import METRICS, RESOLVED, read_run
 from pnet.engine.locks import NO_WAIT
 
 
@@ -21,6 +21,8 @@ def repeated(cfg: DictConfig) -> DictConfig:
 
     old = Path(cfg.repeat)
     again = read_run(old).copy()
+    if "views" not in again:
+        raise ValueError(f"{old / RESOLVED}: written by an older pnet, train again")
     state = read_json(old / "provenance.json")
     commit = git_state(Path(__file__).parent)["commit"]
     if state["git"]["commit"] != commit:

@@ -8,9 +8,10 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig, OmegaConf
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from pnet.cli.app import run_app
+from pnet.cli.app import key_of, run_app
 
 if TYPE_CHECKING:
     from pnet.parts.base import ParametricPart
@@ -31,17 +32,53 @@ def generate_data(cfg: DictConfig) -> None:
     """Make what is missing of the data set, with a progress bar and a summary."""
     from pnet.engine.locks import hold
 
+    check_values(cfg)
     if cfg.like is not None:
         cfg = like(cfg)
     plan = build_plan(cfg)
     piles = plan.factory.piles
+    check_overrides(cfg, piles.part.name)
     tasks = plan_tasks(piles.part, piles.protocol)  # may refuse the settings, so before anything is written
     mine = take_share(tasks, cfg.shard)
-    busy = plan.piles if plan.stage == "simulate" else plan.scenes
     # shares of other machines meet on a shared disk, where locks cannot be trusted; files come by renaming
-    with hold(busy, f"another process makes {busy}") if cfg.shard is None else nullcontext():
+    waiting = f"another process makes {plan.scenes}"
+    with hold(plan.scenes, waiting) if cfg.shard is None else nullcontext():
         open_folders(cfg, plan, tasks)
         make_missing(cfg, plan, mine)
+
+
+def check_values(cfg: DictConfig) -> None:
+    """Refuse wrong values before anything is written."""
+    from pnet.scenes.limits import require_number
+    from pnet.scenes.protocol import SPLITS
+
+    require_number("seed", cfg.seed, 0)
+    if cfg.workers is not None:
+        require_number("workers", cfg.workers, 0)
+    if not isinstance(cfg.noise_in, ListConfig) or not set(cfg.noise_in) <= set(SPLITS):
+        raise ValueError(f"noise_in is {cfg.noise_in}, expected a list out of {', '.join(SPLITS)}")
+    if Path(cfg.data.piles).resolve() == Path(cfg.data.root).resolve():
+        raise ValueError(
+            f"data.piles and data.root are both {cfg.data.root}: piles need a folder of their own"
+        )
+
+
+def check_overrides(cfg: DictConfig, part: str) -> None:
+    """Refuse changes of the protocol that would have no say, because it has others for this part."""
+    own = cfg.protocol.get("by_part") or {}
+    for word in given_overrides():
+        key = key_of(word)
+        changed = key.removeprefix("protocol.").split(".")[0]
+        if key.startswith("protocol.") and changed in (own.get(part) or {}):
+            rest = key.removeprefix("protocol.")
+            raise ValueError(
+                f"{key}: for {part} this protocol has its own; set protocol.by_part.{part}.{rest}"
+            )
+
+
+def given_overrides() -> list[str]:
+    """The words of the command line."""
+    return list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
 
 
 def like(cfg: DictConfig) -> DictConfig:
@@ -49,9 +86,16 @@ def like(cfg: DictConfig) -> DictConfig:
     path = Path(cfg.like)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; like= takes a dataset.json")
+    given = {key_of(word) for word in given_overrides()}
+    for key in sorted(given - {"like", "data.root", "data.piles", "workers", "stage", "shard"}):
+        raise ValueError(f"{key} has no say beside like={path}, which takes all settings from there")
+    if given and "data.root" not in given:
+        raise ValueError(f"like={path}: say with data.root= where the scenes shall be")
     try:
         made = {key: json.loads(path.read_text())[key] for key in MAKING}
-    except (ValueError, KeyError, TypeError) as fault:
+    except KeyError as fault:
+        raise ValueError(f"{path}: made by an older pnet, it lacks {fault}; make the data anew") from fault
+    except (ValueError, TypeError) as fault:
         raise ValueError(f"{path}: not a data set's manifest ({fault})") from fault
     rest = {key: cfg[key] for key in ("data", "workers", "stage", "shard")}
     return OmegaConf.create({**made, **rest})
@@ -70,10 +114,12 @@ def take_share(tasks: list["CycleTask"], shard: str | None) -> list["CycleTask"]
 def open_folders(cfg: DictConfig, plan: "Plan", tasks: list["CycleTask"]) -> None:
     """Create the folders of the stages with their manifests, or check the manifests that are there."""
     from pnet.scenes.generation import check_root, open_root
-    from pnet.scenes.manifest import read_manifest
+    from pnet.scenes.manifest import MANIFEST, read_manifest
 
     settings = making_settings(cfg)
     piles, scenes = (manifest_of(part, tasks) for part in (piling_settings(settings), settings))
+    if (plan.piles / MANIFEST).exists() and "camera" in read_manifest(plan.piles):
+        raise ValueError(f"data.piles={plan.piles}: holds scenes; its piles are in {plan.piles / 'piles'}")
     if plan.stage == "render":
         read_manifest(plan.piles, "run pnet-generate stage=simulate first, or name another data.piles")
     if plan.stage != "simulate":
@@ -88,7 +134,7 @@ def make_missing(cfg: DictConfig, plan: "Plan", tasks: list["CycleTask"]) -> Non
     from pnet.reporting.progress import scene_progress
     from pnet.scenes.generation import Summary, generate
 
-    workers = os.cpu_count() or 1 if cfg.workers is None else cfg.workers
+    workers = cores() if cfg.workers is None else cfg.workers
     summary, start = Summary(), perf_counter()
     with scene_progress(len(tasks), len(plan.factory.piles.protocol.scene_drops())) as advance:
         for report in generate(plan, tasks, workers):
@@ -99,6 +145,11 @@ def make_missing(cfg: DictConfig, plan: "Plan", tasks: list["CycleTask"]) -> Non
             advance(report is not None)
     summary.seconds = perf_counter() - start
     print_summary(plan, summary)
+
+
+def cores() -> int:
+    """How many this process may use: under a job scheduler fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def plan_tasks(part: "ParametricPart", protocol: "Protocol") -> list["CycleTask"]:
@@ -150,12 +201,8 @@ def build_plan(cfg: DictConfig) -> "Plan":
     from pnet.scenes.generation import Plan
     from pnet.scenes.manifest import settings_fingerprint
     from pnet.scenes.pile_factory import PileFactory
-    from pnet.scenes.protocol import SPLITS
     from pnet.scenes.view_factory import ViewFactory
 
-    for split in cfg.noise_in:
-        if split not in SPLITS:
-            raise ValueError(f"noise_in holds {split!r}, choose from {', '.join(SPLITS)}")
     settings = making_settings(cfg)
     part = instantiate(cfg.part)
     protocol = instantiate(cfg.protocol).for_part(part.name)

@@ -45,7 +45,7 @@ def open_set(root: Path, piles: Path) -> Opened:
     lacking = [key for key in MAKING if key not in settings]
     if lacking or not isinstance(files, dict):
         key = [*lacking, "files"][0]
-        raise ValueError(f"{path}: no manifest of this pnet's data sets, it lacks {key}; {MADE_BY_GENERATE}")
+        raise ValueError(f"{path}: made by an older pnet, it lacks {key}; make the data anew")
     part = built(path, "part", settings["part"], ParametricPart)
     protocol = built(path, "protocol", settings["protocol"], Protocol).for_part(part.name)
     data = DataSet(

@@ -18,12 +18,12 @@ from pnet.parts.choice import KeypointChoice
 from pnet.parts.keypoints import KeypointChain
 from pnet.records import Batch, Scene
 
-Draw = tuple[int, int]  # scene index and epoch: all that chance depends on, besides the seed
+Draw = tuple[int, int]  # scene index and place in the training: all that chance depends on, besides the seed
 Item = dict[str, Tensor | Tables]  # what a scene gives a batch, by name
 
 
 class LabelledScenes(Dataset[Item]):
-    """Scenes with labels, augmented by (seed, epoch, index) alone, so that a resumed run repeats itself.
+    """Scenes with labels, augmented by (seed, place, index) alone, so that a resumed run repeats itself.
 
     Args:
         scenes: where they come from. chain: the part's keypoints. choice: which equivalent is the label.
@@ -58,11 +58,11 @@ class LabelledScenes(Dataset[Item]):
         return len(self.scenes)
 
     def __getitem__(self, draw: Draw | int) -> Item:
-        index, epoch = (draw, 0) if isinstance(draw, int) else draw
-        chance = np.random.default_rng([self._seed, epoch, index, 1])  # of view and noise
+        index, place = (draw, 0) if isinstance(draw, int) else draw
+        chance = np.random.default_rng([self._seed, place, index, 1])  # of view and noise
         scene = first_points(self.scenes.draw(index, chance), self.points)
         if self._augmentation is not None:
-            scene = self._augmentation(scene, np.random.default_rng([self._seed, epoch, index]))
+            scene = self._augmentation(scene, np.random.default_rng([self._seed, place, index]))
         labels = point_labels(scene, self._chain, self._choice)
         item: Item = {**labels, "scene": torch.tensor(index)}
         if self._posed is not None:
@@ -108,4 +108,4 @@ class EpochSampler(Sampler[Draw]):
     def __iter__(self) -> Iterator[Draw]:
         drawn = self._draws * self._world
         for position in range(self._epoch * drawn + self._rank, (self._epoch + 1) * drawn, self._world):
-            yield self._order[position], self._epoch
+            yield self._order[position], position

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from pnet.data.scene_folder import check_complete
 from pnet.records import Scene, SceneId
 from pnet.scenes.pile_store import PileFile
 from pnet.scenes.record_file import SUFFIX
 from pnet.scenes.view_factory import ViewFactory
 
+REMEDY = "stage=simulate with the same part and protocol"
 ATTEMPTS = 20  # views of one pile that may show no body
 
 
@@ -36,8 +38,11 @@ class RenderedScenes:
     ) -> None:
         files = [PileFile(path) for path in sorted((piles / split).glob(f"[!.]*{SUFFIX}"))]
         if not files:
-            raise FileNotFoundError(
-                f"{piles / split}: no piles there; run pnet-generate with the same part and protocol"
+            raise FileNotFoundError(f"{piles / split}: no piles there; run pnet-generate {REMEDY}")
+        check_complete(piles, split, len(files), REMEDY)
+        if len({file.header.fingerprint for file in files}) > 1:
+            raise ValueError(
+                f"{piles / split}: made with different settings; delete it and make the piles anew"
             )
         for file in files:
             if file.header.part != views.part.name:

@@ -38,7 +38,7 @@ class SceneFolder(Sequence[Scene]):
             raise FileNotFoundError(
                 f"{root / split}: no scenes there; run pnet-generate with the same part and protocol first"
             )
-        _check_complete(root, split, len(self._paths))
+        check_complete(root, split, len(self._paths))
         files = [CycleFile(path) for path in self._paths]
         if len({file.header.fingerprint for file in files}) > 1:
             raise ValueError(
@@ -92,13 +92,13 @@ class SceneFolder(Sequence[Scene]):
         return self._open[path]
 
 
-def _check_complete(root: Path, split: str, found: int) -> None:
-    """Refuse a split of which generation has not made all files yet."""
+def check_complete(root: Path, split: str, found: int, how: str = "again") -> None:
+    """Refuse a split of which generation has not made all files yet. how: to run pnet-generate then."""
     if not (root / MANIFEST).exists():
         return
     planned = read_manifest(root).get("files", {}).get(split, found)
     if found < planned:
         raise ValueError(
-            f"{root / split}: only {found} of {planned} cycles are there; run pnet-generate again, "
+            f"{root / split}: only {found} of {planned} cycles are there; run pnet-generate {how}, "
             "which makes what is missing"
         )

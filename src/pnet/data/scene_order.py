@@ -41,24 +41,31 @@ class Permutations:
 
 
 class Mixture:
-    """Two orders mixed by a share, evenly at any length.
+    """Two orders mixed by a share: exactly in every block of as many places as the share's denominator, and
+    by chance within it, so that processes which take every n-th place see both.
 
     Args:
-        first, second: the orders. share: of the second, in [0, 1].
+        first, second: the orders. share: of the second, in [0, 1]. seed: of the places.
     """
 
-    def __init__(self, first: SceneOrder, second: SceneOrder, share: float) -> None:
+    def __init__(self, first: SceneOrder, second: SceneOrder, share: float, seed: int) -> None:
         if not 0 <= share <= 1:
             raise ValueError(f"data.clutter is {share}, expected a share in [0, 1]")
-        # exact at any position: a float's product would lose its last digits
-        self._first, self._second, self._share = first, second, Fraction(share).limit_denominator(1000)
+        self._first, self._second, self._seed = first, second, seed
+        exact = Fraction(share).limit_denominator(1000)
+        self._many, self._length = exact.numerator, exact.denominator
+        self._block, self._is_second = -1, np.zeros(self._length, bool)
 
     def __len__(self) -> int:
         return len(self._first) + len(self._second)
 
     def __getitem__(self, position: int) -> int:
-        before, after = int(position * self._share), int((position + 1) * self._share)
-        return self._second[before] if after > before else self._first[position - before]
+        block, place = divmod(position, self._length)
+        if block != self._block:
+            rng = np.random.default_rng([self._seed, block, 2])  # after the streams of the two orders
+            self._is_second, self._block = rng.permutation(self._length) < self._many, block
+        before = block * self._many + int(self._is_second[:place].sum())
+        return self._second[before] if self._is_second[place] else self._first[position - before]
 
 
 def mixed_order(kinds: Sequence[str], seed: int, clutter: float | None) -> SceneOrder:
@@ -79,4 +86,4 @@ def mixed_order(kinds: Sequence[str], seed: int, clutter: float | None) -> Scene
                 f"data.clutter={clutter:g} asks for scenes of kind {kind}, but training has none of them"
             )
     pile, more = (Permutations(places[kind], seed, i) for i, kind in enumerate(("pile", "clutter")))
-    return Mixture(pile, more, clutter)
+    return Mixture(pile, more, clutter, seed)

@@ -13,10 +13,11 @@ from pnet.data.scene_folder import SceneFolder
 from pnet.geometry.camera import Camera
 from pnet.parts.base import ParametricPart
 from pnet.records import Scene, SceneId
-from pnet.scenes.manifest import read_manifest
+from pnet.scenes.limits import require_range
+from pnet.scenes.manifest import MANIFEST, read_manifest
 from pnet.scenes.noise import NoNoise, SensorNoise
 from pnet.scenes.view_factory import ViewFactory
-from pnet.scenes.viewpoints import Viewpoints
+from pnet.scenes.viewpoints import MOST_TILT, Viewpoints
 
 Keep = Callable[[set[int]], set[int]]
 
@@ -61,12 +62,30 @@ class StoredViews:
     ) -> SceneSource:
         """See `Views`."""
         stored = SceneFolder(root, "train", part.name, keep=keep)
-        return stored if isinstance(noise, NoNoise) else NoisyScenes(stored, noise)
+        if isinstance(noise, NoNoise):
+            return stored
+        if has_noise(root, "train"):
+            raise ValueError(
+                f"{root}: its scenes for training have a noise already; train with noise=none, or make them "
+                "without (pnet-generate noise_in=[val,test_l,test_g])"
+            )
+        return NoisyScenes(stored, noise)
+
+
+def has_noise(root: Path, split: str) -> bool:
+    """Whether a split's stored scenes were measured by a noisy sensor, as the manifest says."""
+    if not (root / MANIFEST).exists():
+        return False
+    made = read_manifest(root)
+    target = (made.get("noise") or {}).get("_target_", "")
+    return bool(target) and not target.endswith(f".{NoNoise.__name__}") and split in made.get("noise_in", [])
 
 
 @dataclass(frozen=True)
 class RandomViews:
     """A new view of every pile in every epoch, rendered when it is read: few piles give endless views.
+
+    Noise that the stored scenes may have is not in them: views are rendered from piles.
 
     Attributes:
         distance, tilt, turn: see `Viewpoints`. piles: their folder inside the data set's.
@@ -76,6 +95,10 @@ class RandomViews:
     tilt: Sequence[float]
     turn: bool = True
     piles: str = "piles"
+
+    def __post_init__(self) -> None:
+        require_range("views.distance", self.distance, 0, above=True)
+        require_range("views.tilt", self.tilt, 0, MOST_TILT)
 
     def open(
         self, root: Path, part: ParametricPart, points: int | None, noise: SensorNoise, keep: Keep | None

@@ -73,7 +73,9 @@ class Solid:
             part = manifold(shape.mesh(sections))
             whole = whole + part if operation is Operation.ADD else whole - part
         found = whole.to_mesh64()
-        return trimesh.Trimesh(found.vert_properties[:, :3], found.tri_verts.astype(np.int64), process=False)
+        # copies: views would keep the library's object alive past its end
+        vertices, faces = np.array(found.vert_properties[:, :3]), np.array(found.tri_verts, np.int64)
+        return trimesh.Trimesh(vertices, faces, process=False)
 
     def pieces(self, sections: int, fill_holes: bool) -> list[Points]:
         """Convex pieces whose union is the solid, (n_i, 3) each; they may overlap.

@@ -4,11 +4,13 @@ Piles rarely show a flat part standing on its rim; clutter shows every orientati
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pnet.parts.base import ParametricPart
+from pnet.scenes.limits import require_number
 from pnet.scenes.overlap import ConvexPiece, penetration
 from pnet.scenes.pile import Bin, Pile, Points
 
@@ -31,10 +33,8 @@ class Clutter:
     overlap: bool = True
 
     def __post_init__(self) -> None:
-        if self.spacing < 0:
-            raise ValueError(f"clutter.spacing is {self.spacing}, expected at least 0")
-        if self.density <= 0:
-            raise ValueError(f"clutter.density is {self.density}, expected more than 0")
+        require_number("clutter.spacing", self.spacing, 0)
+        require_number("clutter.density", self.density, 0, above=True)
 
     def scatter(
         self, part: ParametricPart, parameters: Points, box: Bin, count: int, rng: np.random.Generator
@@ -46,12 +46,11 @@ class Clutter:
         Returns:
             A `Pile` of at most `count` bodies; one that finds no room is left out.
         """
-        radius = float(np.linalg.norm(part.mesh(parameters).vertices, axis=1).max())
+        radius, pieces = _outline(part, tuple(parameters.tolist()))
         half = np.maximum(np.array([box.width, box.depth]) / 2 - radius, 0)
         layers = count * (2 * radius) ** 2 / (box.width * box.depth * self.density)
         depth = min(box.height, 2 * radius * (1 + layers))
         low, high = np.array([*-half, radius]), np.array([*half, max(depth, 2 * radius)])
-        pieces = [] if self.overlap else [ConvexPiece(p) for p in part.convex_pieces(parameters, True)]
         turns, placed = np.zeros((0, 3, 3)), np.zeros((0, 3))
         for _ in range(count):
             candidates, turn = rng.uniform(low, high, (ATTEMPTS, 3)), Rotation.random(rng=rng).as_matrix()
@@ -65,3 +64,11 @@ class Clutter:
                     turns, placed = np.concatenate([turns, turn[None]]), np.concatenate([placed, place[None]])
                     break
         return Pile(turns, placed, drop=count)
+
+
+@lru_cache(maxsize=16)  # a cycle scatters the same part object scene after scene
+def _outline(part: ParametricPart, parameters: tuple[float, ...]) -> tuple[float, list[ConvexPiece]]:
+    """Radius of a part object's bounding sphere, metres, and its convex pieces without holes."""
+    size = np.array(parameters)
+    pieces = [ConvexPiece(corners) for corners in part.convex_pieces(size, fill_holes=True)]
+    return float(np.linalg.norm(part.mesh(size).vertices, axis=1).max()), pieces

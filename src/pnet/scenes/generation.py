@@ -109,10 +109,7 @@ class Plan:
             write_piles(path, *made)
             times.simulate, times.write = simulated - start, perf_counter() - simulated
         file = PileFile(path)
-        if file.header.fingerprint != self.factory.piles.fingerprint:
-            raise ValueError(
-                f"{path}: its piles were made with other settings; delete it and run stage=simulate"
-            )
+        self._check_piles(file, task)
         piles = [file.pile(i) for i in range(len(file))]  # as they are read: so stages agree to the bit
         if self.stage == "simulate":
             unsettled = sum(not pile.settled for pile in piles)
@@ -125,6 +122,13 @@ class Plan:
         header = cycle.header
         counts = (len(cycle.scenes), header.escaped, header.unsettled, header.empty)
         return CycleReport(task, *counts, missing, times)
+
+    def _check_piles(self, file: PileFile, task: CycleTask) -> None:
+        """Refuse piles of other settings, or of another task that lie in this one's place."""
+        header = file.header
+        place = all(getattr(header, name) == getattr(task, name) for name in CycleTask.__dataclass_fields__)
+        if header.fingerprint != self.factory.piles.fingerprint or not place:
+            raise ValueError(f"{file.path}: made with other settings; delete it and run stage=simulate")
 
     def _has_piles(self, task: CycleTask) -> bool:
         path = cycle_path(self.piles, task)
@@ -177,6 +181,8 @@ def generate(plan: Plan, tasks: Iterable[CycleTask], workers: int) -> Iterator[C
             yield None
         else:
             missing.append(task)
+    if plan.stage == "render":
+        _check_piles_there(plan, missing)
     wanted = {"simulate": [plan.piles], "render": [plan.scenes], "all": [plan.piles, plan.scenes]}
     for split in sorted({task.split for task in missing}):
         for root in wanted[plan.stage]:
@@ -186,6 +192,16 @@ def generate(plan: Plan, tasks: Iterable[CycleTask], workers: int) -> Iterator[C
             yield plan.make(task)
         return
     yield from _in_parallel(plan, missing, workers)
+
+
+def _check_piles_there(plan: Plan, tasks: list[CycleTask]) -> None:
+    """Refuse to begin where piles are missing: the work would stop in the middle."""
+    absent = [path for path in (cycle_path(plan.piles, task) for task in tasks) if not path.exists()]
+    if absent:
+        raise FileNotFoundError(
+            f"{absent[0]}: no such pile file, and {len(absent) - 1} more are missing; run pnet-generate "
+            "stage=simulate first, which makes only what is missing"
+        )
 
 
 def _in_parallel(plan: Plan, tasks: list[CycleTask], workers: int) -> Iterator[CycleReport]:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from pnet.geometry.camera import Camera
 from pnet.scenes.edges import EDGE_REACH
+from pnet.scenes.limits import require_number
 
 Points = NDArray[np.float32]
 Measured = tuple[Points, NDArray[np.bool_]]
@@ -68,7 +69,7 @@ class GaussianNoise:
     sigma: float
 
     def __post_init__(self) -> None:
-        _require("sigma", self.sigma, 0)
+        require_number("noise.sigma", self.sigma, 0)
 
     def __call__(
         self,
@@ -125,15 +126,14 @@ class StructuredLightNoise:
     dropout: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.baseline < np.inf:
-            raise ValueError(f"noise.baseline is {self.baseline}, expected metres above 0")
+        require_number("noise.baseline", self.baseline, 0, above=True)
         for name in ("disparity_sigma", "disparity_step", "lateral_sigma"):
-            _require(name, getattr(self, name), 0)
+            require_number(f"noise.{name}", getattr(self, name), 0)
         for name in ("max_incidence_deg", "incidence_softness_deg"):
-            _require(name, getattr(self, name), 0, 90)
-        _require("edge_pixels", self.edge_pixels, 0, EDGE_REACH)
+            require_number(f"noise.{name}", getattr(self, name), 0, 90)
+        require_number("noise.edge_pixels", self.edge_pixels, 0, EDGE_REACH)
         for name in ("edge_loss", "dropout"):
-            _require(name, getattr(self, name), 0, 1)
+            require_number(f"noise.{name}", getattr(self, name), 0, 1)
 
     def __call__(
         self,
@@ -196,10 +196,3 @@ def fill_lost(kept: NDArray[np.bool_], count: int, scene: str = "the scene") -> 
     if not len(left):
         raise ValueError(f"the sensor noise lost every point of {scene}; weaken what `noise` loses")
     return np.resize(left, count).astype(np.int64)
-
-
-def _require(name: str, value: float, low: float, high: float = np.inf) -> None:
-    """Raise ValueError where a setting is no finite number from low to high."""
-    if not low <= value <= high or value == np.inf:
-        wanted = f"at least {low}" if high == np.inf else f"{low} to {high}"
-        raise ValueError(f"noise.{name} is {value}, expected {wanted}")

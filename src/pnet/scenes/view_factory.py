@@ -20,7 +20,9 @@ from pnet.scenes.pile import Pile
 from pnet.scenes.rendering import View, render_view
 from pnet.scenes.viewpoints import Viewpoints
 
-EDGE_STEP = 0.003  # neighbouring pixels whose depths differ by more have an edge between them, metres
+# Neighbouring pixels have an edge between them where the depth changes by more than so many times their
+# distance: more than on a surface that is seen at 80 degrees.
+EDGE_SLOPE = 6.0
 
 
 @dataclass
@@ -89,7 +91,8 @@ class ViewFactory:
         v, u = np.divmod(pixels, self.camera.width)
         cloud = (self.camera.rays(u, v) * image.depth.reshape(-1)[pixels, None]).astype(np.float32)
         incidence = np.rint(255 * image.incidence.reshape(-1)[pixels]).astype(np.uint8)
-        edge = image_edges(image.depth, EDGE_STEP).reshape(-1)[pixels]
+        step = EDGE_SLOPE * float(cloud[:, 2].mean()) / self.camera.fx if len(cloud) else 0.0
+        edge = image_edges(image.depth, step).reshape(-1)[pixels]
         cloud, kept = self.noise(cloud, incidence / 255, edge, self.camera, rng)
         found: dict[str, NDArray[Any]] = {"points": cloud, "incidence": incidence, "edge": edge}
         found["instance"] = image.instance.reshape(-1)[pixels]

@@ -5,8 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pnet.scenes.limits import require_range
 from pnet.scenes.pile import Points
 
+MOST_TILT = 89.0  # degrees; beyond it the camera would look along the floor
 LOOKING_DOWN = np.diag([1.0, -1.0, -1.0])  # world → camera: x stays, y and z turn round
 
 
@@ -26,11 +28,8 @@ class Viewpoints:
     turn: bool = False
 
     def __post_init__(self) -> None:
-        for name, values, limit in (("distance", self.distance, np.inf), ("tilt", self.tilt, 90)):
-            if len(values) != 2 or not 0 <= values[0] <= values[1] < limit:
-                raise ValueError(f"view.{name} is {list(values)}, expected [smallest, largest]")
-        if self.distance[0] == 0:
-            raise ValueError("view.distance must be positive")
+        require_range("view.distance", self.distance, 0, above=True)
+        require_range("view.tilt", self.tilt, 0, MOST_TILT)
 
     def draw(self, rng: np.random.Generator) -> tuple[Points, Points]:
         """A place: R (3, 3), t (3,) metres, world → camera."""
