@@ -48,7 +48,8 @@ def main() -> None:
     arguments = parse_arguments()
     print(f"{platform.processor() or platform.machine()}, {arguments.workers or 'no'} workers")
     print(f"{arguments.cycles} cycles of {arguments.drop_limit} drops, {arguments.points} points a scene")
-    for name, index in PARTS.items():
+    for name in arguments.parts:
+        index = PARTS[name]
         for engine in (engine for engine in ENGINES if find_spec(engine)):
             factory = build_factory(name, engine, arguments)
             with tempfile.TemporaryDirectory() as folder:
@@ -63,6 +64,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--drop-limit", type=int, default=60)
     parser.add_argument("--points", type=int, default=16_384)
     parser.add_argument("--cycles", type=int, default=4, help="the table has their medians")
+    parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=list(PARTS))
     parser.add_argument("--workers", type=int, default=2, help="0 works in this process")
     return parser.parse_args()
 

@@ -31,10 +31,10 @@ PARTS = {
     "tn16": (21, "square_200"),
     "tn34": (5, "square_150"),
     "tn42": (21, "square_200"),
-    "candlestick": (0, "square_200"),
-    "gear": (0, "square_200"),
-    "tless20": (0, "square_200"),
-    "tless29": (0, "square_200"),
+    "candlestick": (0, "box_400"),
+    "gear": (0, "box_400"),
+    "tless20": (0, "box_400"),
+    "tless29": (0, "box_400"),
 }
 CAMERA = Camera(512, 512, 2000.0, 2000.0, 255.5, 255.5, near=0.2, far=2.0)
 COLOURS = np.array(

@@ -142,8 +142,8 @@ def test_icp_refines_the_poses_of_pprnets_run():
     baseline = jobs["gear_smoke_method-pprnet"]
     assert baseline.cells == ["Table II: PPR-Net / Gear", "Table II: PPR-Net with ICP / Gear"]
     assert [e.postprocess for e in baseline.evaluations.values()] == [{}, {"refine": ICP}]
-    assert baseline.generate == ("bin=square_200",)
-    assert "data.generate=['bin=square_200']" in baseline.command()
+    assert baseline.generate == ("bin=box_400", "view=far", "camera.far=2")
+    assert "data.generate=['bin=box_400','view=far','camera.far=2']" in baseline.command()
 
 
 def test_icp_alone_trains_pprnet_under_its_plain_name():
@@ -186,7 +186,7 @@ def test_all_tables_are_44_trainings(everything):
 def test_the_siléane_parts_lie_in_the_wider_bin(everything):
     wide = {name.split("_")[0] for name, job in by_name(everything).items() if job.generate}
     assert wide == {"candlestick", "gear", "tless20", "tless29"}
-    assert {job.generate for job in everything} == {(), ("bin=square_200",)}
+    assert {job.generate for job in everything} == {(), ("bin=box_400", "view=far", "camera.far=2")}
 
 
 def test_a_part_restricts_a_sweep_to_its_cells():
@@ -275,8 +275,8 @@ def test_data_of_ones_own_is_not_made():
 def test_settings_of_the_data_reach_pnet_generate():
     words = ("protocol=smoke", "part=gear", "method=parametricnet", "data.generate=['workers=0']")
     (job,) = planned("table2", *words)
-    assert job.generate == ("bin=square_200", "workers=0")
-    assert list(resolved(*job.command()).data.generate) == ["bin=square_200", "workers=0"]
+    assert job.generate == ("bin=box_400", "view=far", "camera.far=2", "workers=0")
+    assert list(resolved(*job.command()).data.generate) == ["bin=box_400", "view=far", "camera.far=2", "workers=0"]
 
 
 def test_a_choice_that_no_cell_has_is_refused():

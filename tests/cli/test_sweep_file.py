@@ -112,7 +112,7 @@ def test_the_columns_of_table_2_are_siléanes_parts_in_the_wider_bin():
         ("T-Less20", "part=tless20"),
         ("T-Less29", "part=tless29"),
     ]
-    assert all(column.generate == ("bin=square_200",) for column in table.columns)
+    assert all(column.generate == ("bin=box_400", "view=far", "camera.far=2") for column in table.columns)
     assert "synthetic" in table.note and "stand-ins" in table.note
 
 
@@ -153,7 +153,7 @@ def test_cells_are_those_that_are_trained_row_by_row():
     assert cells[3].overrides == ("method=parametricnet", "data.learn=1/3", "part=tn06")
     assert cells[3].name == "Table IV: TN06 / Learn 1/3, Ours"
     first = next(iter(one("table2").cells()))
-    assert first.name == "Table II: PPR-Net / C.stick" and first.generate == ("bin=square_200",)
+    assert first.name == "Table II: PPR-Net / C.stick" and first.generate[0] == "bin=box_400"
 
 
 # files of one's own

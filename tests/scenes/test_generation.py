@@ -197,7 +197,7 @@ def test_rendering_with_another_camera_needs_no_physics_engine(
 def test_rendering_without_piles_names_the_file_and_the_stage(factory, root, tasks):
     plan = open_plan(factory, root, "render")
     missing = cycle_path(plan.piles, tasks[0])
-    message = f"{missing}: no such pile file; run pnet-generate stage=simulate"
+    message = f"{missing}: no such pile file, and 4 more are missing; run pnet-generate stage=simulate"
     with pytest.raises(FileNotFoundError, match=message):
         list(generate(plan, tasks, workers=0))
     assert set(part_of(contents(root), "render")) == {MANIFEST}
