@@ -36,7 +36,7 @@ PARTS = {
     "tless20": (0, "box_400"),
     "tless29": (0, "box_400"),
 }
-CAMERA = Camera(512, 512, 2000.0, 2000.0, 255.5, 255.5, near=0.2, far=2.0)
+PIXELS, DISTANCE = 512, 2.0  # of the square image; of the camera from the floor, metres
 COLOURS = np.array(
     [[86, 140, 190], [222, 147, 64], [104, 168, 96], [190, 96, 110], [140, 120, 180], [150, 130, 110]]
 )
@@ -103,7 +103,7 @@ def piles_of(
         full = piles[-1]
         found["t"].append(full.t[:, 2])
         found["axis"].append(np.abs(full.R[:, 2, 2]))
-        view = seen_from_above(part, size, full)
+        view = seen_from_above(part, size, full, box)
         picture = shaded(view) if picture is None else picture
         found["visible"].append(view.visibility)
         found["depth"].append(depths(part, size, physics, full))
@@ -113,10 +113,12 @@ def piles_of(
     return {**joined, "escaped": escaped, "picture": picture}
 
 
-def seen_from_above(part: ParametricPart, size: np.ndarray, pile: Pile) -> View:
-    """From a camera a metre above."""
-    R, t = Viewpoints((1.0, 1.0)).draw(np.random.default_rng(0))
-    return render_view(CAMERA, part.mesh(size), R @ pile.R, pile.t @ R.T + t)
+def seen_from_above(part: ParametricPart, size: np.ndarray, pile: Pile, box: Bin) -> View:
+    """All of the bin's floor and a rim, from far above."""
+    focal, centre = PIXELS * DISTANCE / (1.3 * max(box.width, box.depth)), (PIXELS - 1) / 2
+    camera = Camera(PIXELS, PIXELS, focal, focal, centre, centre, near=0.2, far=2 * DISTANCE)
+    R, t = Viewpoints((DISTANCE, DISTANCE)).draw(np.random.default_rng(0))
+    return render_view(camera, part.mesh(size), R @ pile.R, pile.t @ R.T + t)
 
 
 def shaded(view: View) -> np.ndarray:
