@@ -12,7 +12,15 @@ from pnet.cli.instantiate import instantiate
 
 GROUPS = sorted(path.relative_to(config_dir()) for path in config_dir().glob("*/*.yaml"))
 COMMANDS = sorted(path.stem for path in config_dir().glob("*.yaml") if path.stem != "training")
-MAKING = {"part", "protocol", "camera", "bin", "physics"}  # of pnet-generate; the others are of pnet-train
+MAKING = {
+    "part",
+    "protocol",
+    "camera",
+    "bin",
+    "physics",
+    "clutter",
+    "view",
+}  # of pnet-generate; the others are of pnet-train
 
 
 def targets(node, path=""):
@@ -112,7 +120,7 @@ def test_what_is_not_on_the_list_is_refused(target):
         "pnet.data.module.torch.load",
         "pnet.data.scene_folder.Path",
         "pnet.scenes.generation.os.system",
-        "pnet.scenes.store.os.remove",
+        "pnet.scenes.record_file.os.remove",
         "pnet.parts.base.np.save",
         "pnet.parts.tn34.DISC",
         "pnet.parts.tn34.TN34.__init__.__globals__",

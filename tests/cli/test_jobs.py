@@ -276,7 +276,12 @@ def test_settings_of_the_data_reach_pnet_generate():
     words = ("protocol=smoke", "part=gear", "method=parametricnet", "data.generate=['workers=0']")
     (job,) = planned("table2", *words)
     assert job.generate == ("bin=box_400", "view=far", "camera.far=2", "workers=0")
-    assert list(resolved(*job.command()).data.generate) == ["bin=box_400", "view=far", "camera.far=2", "workers=0"]
+    assert list(resolved(*job.command()).data.generate) == [
+        "bin=box_400",
+        "view=far",
+        "camera.far=2",
+        "workers=0",
+    ]
 
 
 def test_a_choice_that_no_cell_has_is_refused():

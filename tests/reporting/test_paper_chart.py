@@ -101,7 +101,7 @@ def test_nothing_is_left_where_the_file_cannot_be_written(fourth, tmp_path, monk
     def broken(*_):
         raise OSError("the disk is full")
 
-    monkeypatch.setattr("pnet.scenes.store.os.replace", broken)
+    monkeypatch.setattr("pnet.scenes.record_file.os.replace", broken)
     with pytest.raises(OSError, match="full"):
         chart(fourth, tmp_path / "table.png")
     assert list(tmp_path.iterdir()) == []

@@ -189,7 +189,7 @@ def test_nothing_is_left_where_the_file_cannot_be_written(bar, tmp_path, monkeyp
     def broken(*_):
         raise OSError("the disk is full")
 
-    monkeypatch.setattr("pnet.scenes.store.os.replace", broken)
+    monkeypatch.setattr("pnet.scenes.record_file.os.replace", broken)
     with pytest.raises(OSError, match="full"):
         room.part_picture(bar, bar.part_object("L", 0), tmp_path / "bar.png")
     with pytest.raises(OSError, match="full"):

@@ -172,7 +172,7 @@ def write_atomically(path: Path, content: bytes) -> None:
         os.replace(temporary, path)
     except BaseException as fault:
         temporary.unlink(missing_ok=True)
-        if isinstance(fault, OSError) and fault.filename is None:
+        if isinstance(fault, OSError) and fault.errno is not None and fault.filename is None:
             fault.filename = str(path)  # a full disk says so without it
         raise
 
