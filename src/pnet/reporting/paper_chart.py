@@ -72,7 +72,8 @@ class Layout:
     def height(self, texts: Iterable[str]) -> float:
         """Of texts at a bar, which are turned where one is wider than a bar and its gap."""
         texts = list(texts)
-        if max(_width(text, _SMALL) for text in texts) + 5 <= self.slot:
+        # as drawn a text is up to some percent wider: each letter begins on a pixel
+        if 1.04 * max(_width(text, _SMALL) for text in texts) + 5 <= self.slot:
             return _LINE
         return 12 + max(_width(line, _SMALL) for text in texts for line in self.turned(text).split("\n"))
 
