@@ -1,13 +1,12 @@
 """Scenes that are rendered when they are read: a new view of a stored pile each time."""
 
-from bisect import bisect_right
 from collections.abc import Callable
-from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 
 from pnet.data.scene_folder import check_complete
+from pnet.data.split_files import SplitFiles
 from pnet.records import Scene, SceneId
 from pnet.scenes.pile_store import PileFile
 from pnet.scenes.record_file import SUFFIX
@@ -55,19 +54,16 @@ class RenderedScenes:
             SceneId(h.split, h.kind, h.cycle, h.part_index, drop) for h in headers for drop in h.drops
         ]
         self.points_per_scene = views.points
-        self._views, self._paths = views, [file.path for file in files]
-        self._ends = list(accumulate(len(file) for file in files))
-        # opened again where they are read: file handles do not travel to the loader's workers
-        self._open: dict[Path, PileFile] = {}
+        self._views = views
+        self._files = SplitFiles(PileFile, [file.path for file in files], [len(file) for file in files])
 
     def __len__(self) -> int:
-        return self._ends[-1]
+        return len(self._files)
 
     def draw(self, index: int, rng: np.random.Generator) -> Scene:
         """A view of pile `index`; `rng` alone decides which."""
-        number = bisect_right(self._ends, index)
-        file = self._file(self._paths[number])
-        pile = file.pile(index - (self._ends[number - 1] if number else 0))
+        _, file, place = self._files.locate(index)
+        pile = file.pile(place)
         for _ in range(ATTEMPTS):
             scene = self._views.view(pile, file.header.parameters, self.ids[index], rng)
             if scene is not None:
@@ -76,11 +72,3 @@ class RenderedScenes:
             f"{file.path}: the camera saw no body in {ATTEMPTS} views of {self.ids[index]}; "
             "narrow views.distance or views.tilt"
         )
-
-    def __getstate__(self) -> dict[str, object]:
-        return {**self.__dict__, "_open": {}}
-
-    def _file(self, path: Path) -> PileFile:
-        if path not in self._open:
-            self._open[path] = PileFile(path)
-        return self._open[path]
