@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 from pnet.cli.instantiate import instantiate
 from pnet.data.augmentation import Augmentation
 from pnet.data.module import SceneDataModule, Targets
+from pnet.data.source import StoredData
 from pnet.data.views import RandomViews, StoredViews
 from pnet.ops.operators import plain_operators
 from pnet.ops.sampling import farthest_point_order
@@ -132,7 +133,7 @@ def time_loading(factory: SceneFactory, root: Path) -> None:
     for name, (rule, views, noise) in ways.items():
         data = SceneDataModule(
             factory.piles.part,
-            root,
+            StoredData(root),
             Targets(rule),
             Augmentation(),
             None,

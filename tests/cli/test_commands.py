@@ -623,7 +623,7 @@ def test_multirun_trains_one_after_another(smoke, run_here):
 
 
 def test_score_writes_three_numbers(run_here, tmp_path, tn34):
-    from pnet.metrics.poseutils import write_poseutils
+    from pnet.data.poseutils import write_poseutils
 
     pose = {"R": np.eye(3).tolist(), "t": [0.0, 0.0, 0.6]}
     far = {"R": np.eye(3).tolist(), "t": [0.1, 0.0, 0.6]}

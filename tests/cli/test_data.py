@@ -154,7 +154,7 @@ def test_a_page_lies_beside_the_data(job, run_here):
         ([], "root is missing: give root=…; --help says what it is"),
         (["root=gone"], "gone: no such folder; root= takes the folder of a data set that pnet-generate made"),
         (["root=."], "dataset.json: no data set there; root= takes the folder of a data set that"),
-        (["root=data", "action=verfy"], "action=verfy: no such action, did you mean verify?; choose summary"),
+        (["root=data", "action=verfy"], "action=verfy: no such action, did you mean verify"),
         (["root=data", "action=page", "scenes=0"], "scenes=0: expected 1 to 12"),
         (["root=data", "action=page", "scenes=13"], "scenes=13: expected 1 to 12"),
         (["root=data", "action=page", "split=dev"], "split=dev: data has train, val, test_l, test_g, or all"),

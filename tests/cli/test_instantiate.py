@@ -23,6 +23,12 @@ MAKING = {
 }  # of pnet-generate; the others are of pnet-train
 
 
+NEEDED = {
+    "background/empty_bin": ["background.image=empty.png"],
+    "background/limits": ["background.z=[0.3,0.64]"],
+}
+
+
 def targets(node, path=""):
     if isinstance(node, dict):
         if "_target_" in node:
@@ -59,10 +65,12 @@ def test_every_command_composes_and_builds(command):
 @pytest.mark.parametrize("config", GROUPS, ids=str)
 def test_every_config_of_a_group_composes_and_builds(config: Path):
     group, choice = config.parent.name, config.stem
-    command = "generate" if group in MAKING else "train"
-    override = f"{'+' if group == 'recipe' else ''}{group}={choice}".removeprefix("+")
+    command = "generate" if group in MAKING else "predict" if group == "background" else "train"
+    overrides = [f"{group}={choice}", *NEEDED.get(f"{group}/{choice}", ())]
+    if group == "data" and choice != "stored":
+        overrides += ["data.root=.", *(["data.test_root=."] if choice == "ipa_sileane" else [])]
     with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        cfg = compose(command, overrides=[override], return_hydra_config=True)
+        cfg = compose(command, overrides=overrides, return_hydra_config=True)
     assert cfg.hydra.runtime.choices[group] == choice
     plain = OmegaConf.to_container(cfg, resolve=False)
     plain.pop("hydra")

@@ -12,7 +12,7 @@ from PIL import Image
 
 from pnet.cli.app import config_dir
 from pnet.cli.part import main
-from pnet.metrics.poseutils import read_poseutils, write_poseutils
+from pnet.data.poseutils import read_poseutils, write_poseutils
 from pnet.reporting import part_picture
 
 CRATE = """

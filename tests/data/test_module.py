@@ -9,6 +9,7 @@ import torch
 
 from pnet.data.augmentation import Augmentation
 from pnet.data.module import SceneDataModule, Targets
+from pnet.data.source import StoredData
 from pnet.data.targets import pose_scale
 from pnet.ops.pyramid import Ball, Pyramid
 from pnet.parts.choice import KeypointRule
@@ -27,7 +28,7 @@ def root(tmp_path_factory, tn06, write_split):
 
 def module(root, part, **changes):
     settings = dict(points=None, batch_size=4, draws=None, val_every=1, workers=0, seed=0)
-    return SceneDataModule(part, root, Targets(), Augmentation(), **{**settings, **changes})
+    return SceneDataModule(part, StoredData(root), Targets(), Augmentation(), **{**settings, **changes})
 
 
 def order(data, epochs):

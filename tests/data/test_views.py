@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from pnet.data.noisy_scenes import NoisyScenes
 from pnet.data.rendered_scenes import RenderedScenes
 from pnet.data.scene_folder import SceneFolder
+from pnet.data.source import StoredData
 from pnet.data.views import RandomViews, StoredViews
 from pnet.scenes.manifest import MANIFEST
 from pnet.scenes.noise import GaussianNoise, NoNoise
@@ -45,7 +46,7 @@ def root(tmp_path_factory, tn34, camera):
 
 @pytest.fixture(scope="module")
 def rendered(root, tn34) -> RenderedScenes:
-    return AROUND.open(root, tn34, None, NoNoise(), None)
+    return AROUND.open(StoredData(root), tn34, None, NoNoise(), None)
 
 
 def test_every_pile_is_a_scene(rendered, camera):
@@ -84,16 +85,16 @@ def test_a_new_view_shows_the_same_pile(rendered):
 
 
 def test_noise_is_added_to_the_image_before_it_is_sampled(root, tn34):
-    noisy = AROUND.open(root, tn34, 100, GaussianNoise(0.002), None)
+    noisy = AROUND.open(StoredData(root), tn34, 100, GaussianNoise(0.002), None)
     assert noisy.points_per_scene == 100
-    exact = AROUND.open(root, tn34, 100, NoNoise(), None)
+    exact = AROUND.open(StoredData(root), tn34, 100, NoNoise(), None)
     a, b = (scenes.draw(2, np.random.default_rng(0)) for scenes in (noisy, exact))
     np.testing.assert_array_equal(a.t, b.t)
     assert np.abs(a.points[:, 2] - b.points[:, 2]).max() > 0.002
 
 
 def test_part_objects_can_be_left_out(root, tn34):
-    kept = AROUND.open(root, tn34, None, NoNoise(), lambda objects: objects - {0})
+    kept = AROUND.open(StoredData(root), tn34, None, NoNoise(), lambda objects: objects - {0})
     assert {scene.part_index for scene in kept.ids} == {5} and len(kept) == 3
 
 
@@ -112,7 +113,7 @@ def test_missing_piles_are_named(tmp_path, tn34, camera):
 
 def test_piles_of_another_part_are_refused(root, tn06, camera):
     with pytest.raises(ValueError, match=r"pile_0000_part_00.* a pile of tn34, not of tn06"):
-        AROUND.open(root, tn06, None, NoNoise(), None)
+        AROUND.open(StoredData(root), tn06, None, NoNoise(), None)
 
 
 def test_a_camera_that_never_sees_a_body_is_an_error(root, tn34, camera):
@@ -124,14 +125,14 @@ def test_a_camera_that_never_sees_a_body_is_an_error(root, tn34, camera):
 def test_a_manifest_without_a_camera_is_refused(tmp_path, tn34):
     (tmp_path / MANIFEST).write_text("{}")
     with pytest.raises(ValueError, match="its manifest names no camera"):
-        AROUND.open(tmp_path, tn34, None, NoNoise(), None)
+        AROUND.open(StoredData(tmp_path), tn34, None, NoNoise(), None)
 
 
 def test_stored_views_are_the_folder_itself(tmp_path, tn34, write_split):
     written = write_split(tmp_path, tn34, "train")
-    plain = StoredViews().open(tmp_path, tn34, None, NoNoise(), None)
+    plain = StoredViews().open(StoredData(tmp_path), tn34, None, NoNoise(), None)
     assert isinstance(plain, SceneFolder) and len(plain) == len(written)
     drawn = plain.draw(3, np.random.default_rng(0))
     np.testing.assert_array_equal(drawn.points, written[3].points)
-    noisy = StoredViews().open(tmp_path, tn34, None, GaussianNoise(0.001), None)
+    noisy = StoredViews().open(StoredData(tmp_path), tn34, None, GaussianNoise(0.001), None)
     assert isinstance(noisy, NoisyScenes) and noisy.ids == plain.ids

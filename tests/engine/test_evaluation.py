@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from pnet.engine.estimator import NetworkEstimator, Timing
+from pnet.data.poseutils import write_poseutils
 from pnet.engine.evaluation import SceneScorer, predict_scenes
-from pnet.metrics.poseutils import write_poseutils
+from pnet.engine.method import NetworkMethod, Timing
 from pnet.metrics.sileane_results import score_folder
 from pnet.records import Detections, Scene
 
@@ -130,7 +130,7 @@ def estimator(tn34):
     torch.manual_seed(0)
     backbone = PointNet2([Level(16, 0.05, 8, [8])], [[12]])
     recovery = PoseRecovery(CentroidClusters(0.01, 5, 10), None, MeanVote(), 0.0, False, 0.9, None)
-    return NetworkEstimator(tn34, ParametricNet(backbone, 3, [8], [8], 0.02, True), recovery)
+    return NetworkMethod(tn34, ParametricNet(backbone, 3, [8], [8], 0.02, True), recovery)
 
 
 def test_the_estimator_counts_its_time_and_leaves_the_network_as_it_was(estimator, make_scene, tn34):
@@ -150,7 +150,7 @@ def test_an_empty_cloud_holds_nothing(estimator):
 
 @pytest.mark.parametrize("depth", [0.0, -0.6])
 def test_points_at_or_behind_the_camera_are_refused(part, depth):
-    estimator = NetworkEstimator(part, torch.nn.Linear(1, 1), None)
+    estimator = NetworkMethod(part, torch.nn.Linear(1, 1), None)
     cloud = torch.tensor([[[0.0, 0.0, 0.6], [0.0, 0.0, depth]]])
     with pytest.raises(ValueError, match="at or behind the camera"):
         estimator.estimate(cloud)

@@ -11,9 +11,10 @@ from pnet.backbones.pointnet2 import Level, PointNet2
 from pnet.backbones.range_unet import RangeUNet
 from pnet.data.augmentation import Augmentation
 from pnet.data.module import SceneDataModule, Targets
+from pnet.data.source import StoredData
 from pnet.engine.callbacks import PoseValidation, Throughput
 from pnet.engine.checkpoints import NAME, ResumableCheckpoint, read_checkpoint
-from pnet.engine.estimator import NetworkEstimator
+from pnet.engine.method import NetworkMethod
 from pnet.engine.schedules import WarmupCosine
 from pnet.engine.training import PoseTraining
 from pnet.models.losses import ParametricLoss
@@ -74,11 +75,11 @@ def fit(
     schedule, loss = WarmupCosine(0.1, 0.01), ParametricLoss(part, "each")
     module = PoseTraining(network, loss, optimizer, schedule, False, {"backbone": identity})
     data = SceneDataModule(
-        part, root, Targets(rule), Augmentation(True, 1e-4), None, 2, 2 * EPOCH_STEPS, 1, 0, seed
+        part, StoredData(root), Targets(rule), Augmentation(True, 1e-4), None, 2, 2 * EPOCH_STEPS, 1, 0, seed
     )
     voting = FoldedVote(16, 32, 25.0, 3.0) if rule == "point" else MeanVote()
     recovery = PoseRecovery(CentroidClusters(0.01, 2, 4), None, voting, 0.0, False, 0.9, None)
-    validation = PoseValidation(NetworkEstimator(part, network, recovery), data.scenes("val"), None, 0)
+    validation = PoseValidation(NetworkMethod(part, network, recovery), data.scenes("val"), None, 0)
     callbacks = [validation, ResumableCheckpoint(folder), *extra]
     callbacks += [InterruptAt(interrupt)] if interrupt else []
     trainer = lightning.Trainer(

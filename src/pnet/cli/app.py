@@ -20,7 +20,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, InstantiationException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
 from pnet.cli.instantiate import trusted_modules
 from pnet.engine.locks import Busy
@@ -132,6 +132,10 @@ def error_text(fault: BaseException) -> str:
     """What to tell the user, on one line."""
     if isinstance(fault, MissingMandatoryValue):
         return f"{fault.full_key} is missing: give {fault.full_key}=…; --help says what it is"
+    if isinstance(fault, InterpolationToMissingValueError):  # names the key that points there
+        found = re.search(r"Missing mandatory value: (\S+)", str(fault))
+        key = found.group(1) if found else fault.full_key
+        return f"{key} is missing: give {key}=…; --help says what it is"
     if isinstance(fault, InstantiationException) and fault.__cause__ is not None:
         return error_text(fault.__cause__)  # what our own constructor says is clearer than Hydra's wrapping
     lines = str(fault).strip().splitlines() or [type(fault).__name__]

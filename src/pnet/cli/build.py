@@ -15,13 +15,14 @@ from pnet.backbones.base import Backbone
 from pnet.cli.instantiate import instantiate
 from pnet.cli.settings import is_trained, read_run
 from pnet.data.module import SceneDataModule
+from pnet.data.source import DataSource, StoredData
 from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointRule
 from pnet.postprocess.pipeline import PoseRecovery
 from pnet.postprocess.vote import MeanVote
 
 if TYPE_CHECKING:
-    from pnet.engine.estimator import Estimator, NetworkEstimator, Recovery
+    from pnet.engine.method import Method, NetworkMethod, Recovery
 
 AVERAGING = "pnet.postprocess.pose_average.PoseAveraging"
 UNLEARNT = ("learning", "generalization", "sections")  # keys of a part that weights don't depend on
@@ -40,7 +41,7 @@ class Parts:
 def build_parts(cfg: DictConfig) -> Parts:
     """Part, network and recovery of a config; the network's weights are drawn from its seed."""
     torch.manual_seed(cfg.seed)
-    part: ParametricPart = instantiate(cfg.part)
+    part = part_of(cfg)
     check_ablations(cfg)
     recovery = instantiate(cfg.postprocess)
     plain_means = isinstance(recovery, PoseRecovery) and isinstance(recovery.voting, MeanVote)
@@ -68,7 +69,7 @@ def build_data(cfg: DictConfig, parts: Parts) -> SceneDataModule:
     """The data module of a config; an epoch lasts from one checkpoint to the next."""
     return SceneDataModule(
         parts.part,
-        cfg.data.root,
+        open_source(cfg.data),
         instantiate(cfg.data.targets),
         instantiate(cfg.data.augmentation),
         cfg.data.points,
@@ -85,6 +86,14 @@ def build_data(cfg: DictConfig, parts: Parts) -> SceneDataModule:
     )
 
 
+def open_source(data: DictConfig) -> DataSource:
+    """The data set of the settings `data`: its root and source (null: pnet's own store)."""
+    if data.get("source") is None:  # absent in runs of before
+        return StoredData(Path(data.root))
+    source: DataSource = instantiate(data.source)
+    return source
+
+
 def share(key: str, value: object) -> float:
     """A share such as 0.2 or 1/5, as a number. key: of the setting."""
     try:
@@ -93,13 +102,17 @@ def share(key: str, value: object) -> float:
         raise ValueError(f"{key} is {value!r}, expected a share, for instance 1/3") from None
 
 
+def part_of(cfg: DictConfig) -> ParametricPart:
+    """The part of a run's settings; made once, as it takes a while."""
+    return _part(OmegaConf.to_yaml(cfg.part, resolve=True))
+
+
 @lru_cache
-def part_name(part: str) -> str:
-    """The name of the template that a part's settings (YAML) make; to make one takes a while."""
-    settings = OmegaConf.create(part)
-    assert isinstance(settings, DictConfig)
-    name: str = instantiate(settings).name
-    return name
+def _part(settings: str) -> ParametricPart:
+    node = OmegaConf.create(settings)
+    assert isinstance(node, DictConfig)
+    part: ParametricPart = instantiate(node)
+    return part
 
 
 def identity(cfg: DictConfig) -> dict[str, str]:
@@ -113,7 +126,7 @@ def identity(cfg: DictConfig) -> dict[str, str]:
     }
     texts = {name: OmegaConf.to_yaml(node, resolve=True) for name, node in groups.items()}
     return {
-        "part": part_name(OmegaConf.to_yaml(cfg.part, resolve=True)),
+        "part": part_of(cfg).name,
         "points": str(cfg.data.points),
         **texts,
     }
@@ -140,46 +153,63 @@ def use_bf16(precision: str, accelerator: str) -> bool:
     return bool(torch.cpu._is_avx512_bf16_supported())
 
 
-def load_estimator(run: Path, recovery: DictConfig) -> "Estimator":
-    """The estimator of a run folder.
+def load_method(run: Path, recovery: DictConfig, accelerator: str | None = None) -> "Method":
+    """The method of a run folder.
 
     Args:
         run: made by pnet-train. recovery: settings of a network's post-processing.
+        accelerator: where a network runs; None: as it was trained.
     """
     cfg = read_run(run)
     if not is_trained(cfg):
-        estimator: Estimator = instantiate(cfg.method.estimator, part=instantiate(cfg.part))
-        return estimator
-    return load_network(run, cfg, recovery)
+        method: Method = instantiate(cfg.method.estimator, part=part_of(cfg))
+        return method
+    weights = read_weights(run, cfg)
+    return network_method(cfg, weights, recovery, str(run / "checkpoints"), accelerator)
 
 
-def load_network(run: Path, cfg: DictConfig, recovery: DictConfig) -> "NetworkEstimator":
-    """The trained network of a run folder with a post-processing."""
+def read_weights(run: Path, cfg: DictConfig) -> dict[str, torch.Tensor]:
+    """The weights of a run's network by name; cfg: its settings, to which they must belong."""
     from pnet.engine.checkpoints import NAME, read_checkpoint
-    from pnet.engine.estimator import NetworkEstimator
     from pnet.engine.training import check_identity
 
-    checkpoint = run / "checkpoints" / NAME
+    checkpoint, prefix = run / "checkpoints" / NAME, "network."
     content = read_checkpoint(checkpoint)
     try:
         check_identity(content, identity(cfg))
-        changed = cfg.copy()
-        changed.postprocess = recovery
+    except (ValueError, OmegaConfBaseException) as fault:
+        raise ValueError(f"{checkpoint}: {fault}") from fault
+    state = content["state_dict"].items()
+    return {name.removeprefix(prefix): value for name, value in state if name.startswith(prefix)}
+
+
+def network_method(
+    cfg: DictConfig,
+    weights: dict[str, torch.Tensor],
+    recovery: DictConfig,
+    where: str,
+    accelerator: str | None = None,
+) -> "NetworkMethod":
+    """A trained network with a post-processing.
+
+    Args:
+        cfg: the settings of its training. weights: of the network. recovery: settings of the post-processing.
+        where: the weights come from, for errors. accelerator: where it runs; None: as it was trained.
+    """
+    from pnet.engine.method import NetworkMethod
+
+    changed = cfg.copy()
+    changed.postprocess = recovery
+    try:
         parts = build_parts(changed)
-        prefix = "network."
-        weights = {
-            name.removeprefix(prefix): value
-            for name, value in content["state_dict"].items()
-            if name.startswith(prefix)
-        }
         parts.network.load_state_dict(weights)
     except RuntimeError as fault:  # names or shapes of weights
         raise ValueError(
-            f"{checkpoint}: its weights do not fit the network that this version of pnet builds, train again "
+            f"{where}: its weights do not fit the network that this version of pnet builds, train again "
             f"({str(fault).splitlines()[0]})"
         ) from fault
     except (ValueError, OmegaConfBaseException) as fault:
-        raise ValueError(f"{checkpoint}: {fault}") from fault
-    network = parts.network.to(device_of(cfg.trainer.accelerator)).eval()
-    bf16 = use_bf16(cfg.trainer.precision, cfg.trainer.accelerator)
-    return NetworkEstimator(parts.part, network, parts.recovery, bf16)
+        raise ValueError(f"{where}: {fault}") from fault
+    accelerator = accelerator or cfg.trainer.accelerator
+    network = parts.network.to(device_of(accelerator)).eval()
+    return NetworkMethod(parts.part, network, parts.recovery, use_bf16(cfg.trainer.precision, accelerator))

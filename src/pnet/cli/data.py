@@ -1,5 +1,6 @@
-"""pnet-data: look after a data set: a summary, a check of every file, repair, a page of samples."""
+"""pnet-data: look after a data set: summary, check, repair, page of samples, conversion and export."""
 
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from time import perf_counter
@@ -8,6 +9,7 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from pnet.cli.app import closest, hydra_value, run_app
+from pnet.cli.data_exchange import convert, export
 from pnet.cli.opened_set import Opened, open_set
 
 if TYPE_CHECKING:
@@ -20,17 +22,25 @@ if TYPE_CHECKING:
 PAGE = "page.html"
 
 
+ACTIONS = ("summary", "verify", "repair", "page", "convert", "export")
+
+
 def main() -> None:
-    """Entry point."""
+    """Entry point; `pnet-data convert …` says the same as `pnet-data action=convert …`."""
+    if len(sys.argv) > 1 and sys.argv[1] in ACTIONS:
+        sys.argv[1] = f"action={sys.argv[1]}"
     run_app(look_after, "data_set")
 
 
 def look_after(cfg: DictConfig) -> None:
     """Do what `action` says."""
-    actions = {"summary": summary, "verify": verify, "repair": repair, "page": page}
-    if cfg.action not in actions:
-        near = closest(str(cfg.action), list(actions))
-        raise ValueError(f"action={cfg.action}: no such action{near}; choose {', '.join(actions)}")
+    if cfg.action not in ACTIONS:
+        near = closest(str(cfg.action), list(ACTIONS))
+        raise ValueError(f"action={cfg.action}: no such action{near}; choose {', '.join(ACTIONS)}")
+    if cfg.action == "convert":
+        convert(cfg)
+        return
+    actions = {"summary": summary, "verify": verify, "repair": repair, "page": page, "export": export}
     actions[cfg.action](cfg, open_set(Path(cfg.root), Path(cfg.piles)))
 
 
@@ -74,6 +84,11 @@ def repair(cfg: DictConfig, opened: Opened) -> None:
     from pnet.engine.locks import hold
 
     data, out = opened.data, console()
+    if "converted" in opened.settings:
+        raise ValueError(
+            f"{data.root}: was converted from another data set; delete what action=verify names as damaged "
+            "and run action=convert again, which writes what is missing"
+        )
     with hold(data.root, f"another process makes {data.root}"):
         found, _ = check(data)
         print_faults(out, found.faults)

@@ -44,10 +44,15 @@ def repeated(cfg: DictConfig) -> DictConfig:
 
 def make_data_again(cfg: DictConfig) -> None:
     """Have the data of the run `repeat` made where it is gone; other data in its place is an error."""
+    from pnet.cli.build import open_source
     from pnet.scenes.manifest import MANIFEST, read_manifest
     from pnet.scenes.record_file import SUFFIX
 
     root, wanted = Path(cfg.data.root), read_manifest(Path(cfg.repeat))
+    if cfg.data.get("source") is not None:
+        if open_source(cfg.data).manifest() != wanted:
+            raise ValueError(f"{root}: is not as it was when {cfg.repeat} was trained on it")
+        return
     if (root / MANIFEST).exists() and read_manifest(root) != wanted:
         raise ValueError(
             f"{root}: holds other data than {cfg.repeat} was trained on; move it away and try again"
@@ -62,6 +67,8 @@ def make_data(cfg: DictConfig) -> None:
     """Have pnet-generate make what is missing of the data set, in a process of its own."""
     from pnet.cli.generate import is_complete
 
+    if cfg.data.source is not None:
+        raise ValueError("data.generate makes scenes of pnet's own: it needs data=stored")
     overrides = data_overrides(HydraConfig.get().overrides.task, cfg.data.root, cfg.data.generate)
     if not is_complete(compose("generate", overrides=overrides)):
         run_generate(overrides, cfg.data.root)

@@ -12,7 +12,7 @@ from pnet.cli.app import closest, key_paths, run_app, short_name
 from pnet.cli.settings import METRICS, is_trained, read_run
 
 if TYPE_CHECKING:
-    from pnet.data.scene_folder import SceneFolder
+    from pnet.data.source import DataSource, SceneSet
     from pnet.engine.predictions import PredictionHeader
 
 SPLITS = ("val", "test_l", "test_g")
@@ -32,12 +32,14 @@ class Evaluation:
         split: val, test_l or test_g.
         postprocess: settings that differ from the run's; with a `_target_` it stands in place of all of them.
         every: keep every so many scenes of a cycle. root: another data set of the same part, or None.
+        source: settings of its reader where it is not pnet's own store.
     """
 
     split: str
     postprocess: dict[str, Any] = field(default_factory=dict)
     every: int = 1
     root: Path | None = None
+    source: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
         if self.every < 1:
@@ -79,8 +81,8 @@ def evaluate(cfg: DictConfig) -> None:
         raise ValueError(f"stage={cfg.stage}: choose predict, score or all")
     changes = OmegaConf.to_container(cfg.postprocess)
     assert isinstance(changes, dict)
-    root = Path(cfg.data.root) if cfg.data.root else None
-    evaluation = Evaluation(cfg.split, {str(k): v for k, v in changes.items()}, cfg.every, root)
+    root, source = other_data(cfg)
+    evaluation = Evaluation(cfg.split, {str(k): v for k, v in changes.items()}, cfg.every, root, source)
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
     run = Path(cfg.run)
@@ -91,9 +93,20 @@ def evaluate(cfg: DictConfig) -> None:
         if cfg.stage == "predict":
             return
         metrics = score(evaluation, run, trained)
+        if cfg.results is not None:
+            from pnet.cli.benchmark_results import export_results
+
+            export_results(Path(cfg.results), evaluation, run, trained)
     out = Console(soft_wrap=True)
     out.print(metrics_table(metrics))
     out.print(f"written to {evaluation.folder(run)}; next: pnet-report run={run}")
+
+
+def other_data(cfg: DictConfig) -> tuple[Path | None, dict[str, Any] | None]:
+    """Folder and reader's settings of the data set that a command names beside a run's own."""
+    root = Path(cfg.data.root) if cfg.data.root else None
+    data: Any = OmegaConf.to_container(cfg.data, resolve=True)
+    return root, data["source"]
 
 
 def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -104,26 +117,34 @@ def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield path, node
 
 
-def open_scenes(evaluation: Evaluation, trained: DictConfig) -> tuple["SceneFolder", str]:
+def evaluated_source(evaluation: Evaluation, trained: DictConfig) -> "DataSource":
+    """The data set to evaluate on: the run's own, or another."""
+    from pnet.cli.build import open_source
+
+    if evaluation.root is None:
+        return open_source(trained.data)
+    return open_source(OmegaConf.create({"root": str(evaluation.root), "source": evaluation.source}))
+
+
+def open_scenes(evaluation: Evaluation, trained: DictConfig) -> tuple["SceneSet", str]:
     """The scenes to evaluate, and the fingerprint of their data set."""
-    from pnet.cli.build import identity
-    from pnet.data.scene_folder import SceneFolder
-    from pnet.scenes.manifest import read_manifest, settings_fingerprint
+    from pnet.cli.build import part_of
+    from pnet.scenes.manifest import settings_fingerprint
 
-    root = evaluation.root or Path(trained.data.root)
-    fingerprint = settings_fingerprint(read_manifest(root))
-    return SceneFolder(root, evaluation.split, identity(trained)["part"], evaluation.every), fingerprint
+    source = evaluated_source(evaluation, trained)
+    fingerprint = settings_fingerprint(source.manifest())
+    return source.scenes(evaluation.split, part_of(trained), evaluation.every), fingerprint
 
 
-def recovery_settings(evaluation: Evaluation, trained: DictConfig) -> DictConfig:
-    """The run's post-processing with this evaluation's changes; an unknown key is an error."""
-    changes = OmegaConf.create(evaluation.postprocess)
+def recovery_settings(changed: dict[str, Any], trained: DictConfig) -> DictConfig:
+    """A run's post-processing with changed settings; an unknown key is an error."""
+    changes = OmegaConf.create(changed)
     if "_target_" in changes:
         return changes
     merged = OmegaConf.create(OmegaConf.to_container(trained.postprocess, resolve=True))
     empty = [key for key, value in _leaves(OmegaConf.to_container(merged)) if value is None]
     known = list(key_paths(OmegaConf.to_container(merged)))
-    for key in key_paths(evaluation.postprocess):
+    for key in key_paths(changed):
         if key not in known and not key.startswith(tuple(f"{name}." for name in empty)):
             raise ValueError(f"postprocess.{key}: unknown key{closest(key, known)}")
     return OmegaConf.merge(merged, changes)  # type: ignore[return-value]
@@ -133,7 +154,7 @@ def expected_header(evaluation: Evaluation, run: Path, trained: DictConfig, data
     """What predictions of this evaluation must say of themselves."""
     from pnet.cli.build import identity
 
-    recovery = OmegaConf.to_yaml(recovery_settings(evaluation, trained))
+    recovery = OmegaConf.to_yaml(recovery_settings(evaluation.postprocess, trained))
     return {
         "part": identity(trained)["part"],
         "split": evaluation.split,
@@ -181,18 +202,18 @@ def is_current(evaluation: Evaluation, run: Path, trained: DictConfig) -> bool:
 
 def predict(evaluation: Evaluation, run: Path) -> None:
     """The first step: detections of every scene into a file."""
-    from pnet.cli.build import load_estimator
+    from pnet.cli.build import load_method
     from pnet.engine.evaluation import predict_scenes
     from pnet.engine.predictions import PredictionHeader, write_predictions
     from pnet.reporting.progress import count_progress
 
     trained = read_run(run)
-    estimator = load_estimator(run, recovery_settings(evaluation, trained))
+    method = load_method(run, recovery_settings(evaluation.postprocess, trained))
     scenes, data = open_scenes(evaluation, trained)
     expected = expected_header(evaluation, run, trained, data)
     with count_progress(f"predicting {evaluation.name}", len(scenes), "scenes") as advance:
-        found = predict_scenes(estimator, scenes, trained.data.points, advance)
-    timing = estimator.timing
+        found = predict_scenes(method, scenes, trained.data.points, advance)
+    timing = method.timing
     seconds = {
         "network": timing.network / timing.scenes,
         "postprocess": timing.postprocess / timing.scenes,
@@ -226,7 +247,7 @@ def score(evaluation: Evaluation, run: Path, trained: DictConfig) -> dict[str, A
 
 
 def check_predictions(
-    path: Path, header: "PredictionHeader", expected: dict[str, str], scenes: "SceneFolder"
+    path: Path, header: "PredictionHeader", expected: dict[str, str], scenes: "SceneSet"
 ) -> None:
     """Raise ValueError where predictions belong to other data, weights, settings or scenes."""
     for key, value in expected.items():

@@ -25,12 +25,12 @@ def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
     from pnet.engine.allocator import keep_freed_memory
     from pnet.engine.callbacks import PoseValidation, Throughput
     from pnet.engine.checkpoints import NAME, ResumableCheckpoint, read_checkpoint
-    from pnet.engine.estimator import NetworkEstimator
+    from pnet.engine.method import NetworkMethod
     from pnet.engine.provenance import read_json
     from pnet.engine.tensorboard import add_settings
     from pnet.engine.training import PoseTraining, check_identity
     from pnet.models.summary import summarise
-    from pnet.scenes.manifest import read_manifest, settings_fingerprint
+    from pnet.scenes.manifest import settings_fingerprint
 
     if cfg.trainer.threads is not None:
         torch.set_num_threads(cfg.trainer.threads)
@@ -48,10 +48,10 @@ def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
         instantiate(cfg.optimizer),
         instantiate(cfg.schedule),
         bf16,
-        {**identity(cfg), "data": settings_fingerprint(read_manifest(data.root))},
+        {**identity(cfg), "data": settings_fingerprint(data.source.manifest())},
     )
     throughput = Throughput()
-    estimator = NetworkEstimator(parts.part, parts.network, parts.recovery, bf16)
+    estimator = NetworkMethod(parts.part, parts.network, parts.recovery, bf16)
     callbacks = [
         throughput,
         PoseValidation(estimator, validation, cfg.data.points, cfg.trainer.mesh_every),
@@ -91,11 +91,12 @@ def is_helper() -> bool:
 
 def begin_run(cfg: DictConfig, run: Path) -> None:
     """Write what the run is made of; metrics.json of an earlier one goes."""
+    from pnet.cli.build import open_source
     from pnet.engine.provenance import commit_text, provenance, write_json
-    from pnet.scenes.manifest import MANIFEST, read_manifest
+    from pnet.scenes.manifest import MANIFEST
     from pnet.scenes.record_file import write_atomically
 
-    data = read_manifest(Path(cfg.data.root))
+    data = open_source(cfg.data).manifest()
     run.mkdir(parents=True, exist_ok=True)
     (run / METRICS).unlink(missing_ok=True)
     write_json(run / MANIFEST, data)  # how the data was made, so that the folder is enough to repeat the run

@@ -41,6 +41,8 @@ def open_set(root: Path, piles: Path) -> Opened:
         settings = read_manifest(root, MADE_BY_GENERATE)
     except UnicodeDecodeError as fault:
         raise ValueError(f"{path}: not readable ({fault}); {MADE_BY_GENERATE}") from fault
+    if "converted" in settings:
+        return _open_converted(root, path, settings)
     files = settings.pop("files", None)
     lacking = [key for key in MAKING if key not in settings]
     if lacking or not isinstance(files, dict):
@@ -58,6 +60,25 @@ def open_set(root: Path, piles: Path) -> Opened:
         piles_fingerprint=settings_fingerprint(piling_settings(settings)),
         files=files,
     )
+    return Opened(data, settings)
+
+
+def _open_converted(root: Path, path: Path, settings: dict[str, Any]) -> Opened:
+    """A store that pnet-data convert made: its manifest lists the files, and there are no piles."""
+    from pnet.parts.base import ParametricPart
+    from pnet.scenes.inspection import DataSet
+    from pnet.scenes.protocol import CycleTask
+
+    try:
+        tasks = [
+            CycleTask(str(split), str(kind), "G" if split == "test_g" else "L", int(cycle), int(index))
+            for split, kind, cycle, index in settings.pop("cycles")
+        ]
+        files, fingerprint = dict(settings.pop("files")), str(settings["fingerprint"])
+        part = built(path, "part", settings["part"], ParametricPart)
+    except (KeyError, TypeError) as fault:
+        raise ValueError(f"{path}: not the manifest of a converted data set ({fault})") from fault
+    data = DataSet(root, root / "piles", part, None, tasks, fingerprint, "", files)
     return Opened(data, settings)
 
 

@@ -46,7 +46,7 @@ def show_parts(cfg: DictConfig) -> None:
 
 def show_part(out: "Console", part: "ParametricPart", cfg: DictConfig, folder: Path) -> bool:
     """Tables and files of one part; whether all its checks passed."""
-    from pnet.metrics.poseutils import write_poseutils
+    from pnet.data.poseutils import write_poseutils
     from pnet.reporting.part_picture import part_picture
     from pnet.reporting.part_tables import check_table, constants_table, keypoint_table, parameter_table
 

@@ -10,7 +10,7 @@ from pnet.cli.app import run_app
 from pnet.cli.settings import read_run
 
 if TYPE_CHECKING:
-    from pnet.data.scene_folder import SceneFolder
+    from pnet.data.source import SceneSet
     from pnet.parts.base import ParametricPart
     from pnet.records import Detections
 
@@ -24,10 +24,8 @@ def report(cfg: DictConfig) -> None:
     """Write report.html and scene.png into the run's report folder; print their paths and the metrics."""
     from rich.console import Console
 
-    from pnet.cli.build import identity
-    from pnet.cli.evaluate import PREDICTIONS
+    from pnet.cli.evaluate import PREDICTIONS, Evaluation, open_scenes, other_data
     from pnet.cli.instantiate import instantiate
-    from pnet.data.scene_folder import SceneFolder
     from pnet.engine.predictions import read_predictions
     from pnet.engine.provenance import read_json
     from pnet.reporting.page import write_page
@@ -41,11 +39,13 @@ def report(cfg: DictConfig) -> None:
     metrics = read_json(evaluation / "metrics.json")
     header, found = read_predictions(evaluation / PREDICTIONS)
     part = instantiate(trained.part)
-    scenes = SceneFolder(
-        data_root(header.data, Path(cfg.data.root or trained.data.root)),
-        header.split,
-        identity(trained)["part"],
-    )
+    root, source = other_data(cfg)
+    scenes, fingerprint = open_scenes(Evaluation(header.split, root=root, source=source), trained)
+    if fingerprint != header.data:
+        raise ValueError(
+            f"{root or trained.data.root}: is not the data that the predictions were made from; "
+            "give data.root (and data=) as for pnet-evaluate, or evaluate again"
+        )
     shown = pick_scenes(header.scenes, cfg.scenes)
     folder = run / "report"
     folder.mkdir(exist_ok=True)
@@ -59,17 +59,6 @@ def report(cfg: DictConfig) -> None:
     out.print(f"report: {folder / 'report.html'}\npicture: {folder / 'scene.png'}")
 
 
-def data_root(fingerprint: str, root: Path) -> Path:
-    """The data folder, if it holds the data that was predicted."""
-    from pnet.scenes.manifest import read_manifest, settings_fingerprint
-
-    if settings_fingerprint(read_manifest(root)) != fingerprint:
-        raise ValueError(
-            f"{root}: is not the data that the predictions were made from; give data.root, or evaluate again"
-        )
-    return root
-
-
 def pick_scenes(ids: list[str], count: int) -> list[int]:
     """Indices of the fullest scene of `count` cycles, spread over all cycles."""
     fullest: dict[str, int] = {}
@@ -80,7 +69,7 @@ def pick_scenes(ids: list[str], count: int) -> list[int]:
     return [cycles[round(i * (len(cycles) - 1) / max(count - 1, 1))] for i in range(count)]
 
 
-def scene_index(scenes: "SceneFolder", name: str) -> int:
+def scene_index(scenes: "SceneSet", name: str) -> int:
     """Where a scene stands in the split."""
     return [str(scene_id) for scene_id in scenes.ids].index(name)
 
@@ -91,7 +80,7 @@ def page_content(
     metrics: dict[str, Any],
     curve: dict[str, Any],
     part: "ParametricPart",
-    scenes: "SceneFolder",
+    scenes: "SceneSet",
     ids: list[str],
     found: "list[Detections]",
     shown: list[int],

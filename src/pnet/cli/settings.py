@@ -29,6 +29,7 @@ def training_settings(run: DictConfig | dict[str, Any]) -> dict[str, Any]:
     settings: Any = (
         OmegaConf.to_container(run, resolve=True) if isinstance(run, DictConfig) else deepcopy(run)
     )
+    settings["data"].setdefault("source", None)  # runs of before had pnet's own store alone
     for key in DECIDE_NOTHING:
         group, _, name = key.rpartition(".")
         (settings.get(group, {}) if group else settings).pop(name, None)

@@ -61,6 +61,11 @@ class LabelledScenes(Dataset[Item]):
         index, place = (draw, 0) if isinstance(draw, int) else draw
         chance = np.random.default_rng([self._seed, place, index, 1])  # of view and noise
         scene = first_points(self.scenes.draw(index, chance), self.points)
+        if not len(scene.points):
+            raise ValueError(
+                f"{scene.id}: no body was measured there, so there is nothing to learn; pnet-data convert "
+                "leaves such scenes out"
+            )
         if self._augmentation is not None:
             scene = self._augmentation(scene, np.random.default_rng([self._seed, place, index]))
         labels = point_labels(scene, self._chain, self._choice)

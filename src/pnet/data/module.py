@@ -1,8 +1,7 @@
-"""The LightningDataModule over pnet's own store."""
+"""The LightningDataModule over a data set."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import lightning
@@ -11,8 +10,8 @@ from torch.utils.data import DataLoader
 
 from pnet.data.augmentation import Augmentation
 from pnet.data.dataset import EpochSampler, LabelledScenes, collate
-from pnet.data.scene_folder import SceneFolder
 from pnet.data.scene_order import mixed_order
+from pnet.data.source import DataSource, SceneSet
 from pnet.data.views import SceneSource, StoredViews, Views
 from pnet.ops.pyramid import Pyramid
 from pnet.parts.base import ParametricPart
@@ -49,7 +48,7 @@ class SceneDataModule(lightning.LightningDataModule):
     """Loaders of the splits train, val, test_l, test_g.
 
     Args:
-        part: what the scenes show. root: the data set's folder.
+        part: what the scenes show. source: the data set.
         targets, augmentation: see their classes; augmentation in training only.
         points: N, the first so many of a scene's points; None: all.
         batch_size: scenes. draws: scenes of an epoch; None: each once.
@@ -64,7 +63,7 @@ class SceneDataModule(lightning.LightningDataModule):
     def __init__(
         self,
         part: ParametricPart,
-        root: str | Path,
+        source: DataSource,
         targets: Targets,
         augmentation: Augmentation,
         points: int | None,
@@ -86,20 +85,20 @@ class SceneDataModule(lightning.LightningDataModule):
             raise ValueError(f"data.points is {points}, expected at least 1, or null for all")
         if batch_size < 1:
             raise ValueError(f"data.batch_size is {batch_size}, expected at least 1")
-        self.part, self.root, self.targets, self.points = part, Path(root), targets, points
+        self.part, self.source, self.targets, self.points = part, source, targets, points
         self._augmentation, self._batch_size, self._draws = augmentation, batch_size, draws
         self._val_every, self._workers, self._seed = val_every, workers, seed
         self._pyramid, self._learn = pyramid, learn
         self._views, self._noise, self._clutter = views or StoredViews(), noise or NoNoise(), clutter
 
-    def scenes(self, split: str, every: int = 1) -> SceneFolder:
+    def scenes(self, split: str, every: int = 1) -> SceneSet:
         """The scenes of a split."""
-        return SceneFolder(self.root, split, self.part.name, every)
+        return self.source.scenes(split, self.part, every)
 
     def train_scenes(self) -> SceneSource:
         """The training scenes of the part objects that are learnt."""
         keep = self._learnt if self._learn < 1 else None
-        return self._views.open(self.root, self.part, self.points, self._noise, keep)
+        return self._views.open(self.source, self.part, self.points, self._noise, keep)
 
     def _learnt(self, objects: set[int]) -> set[int]:
         """Of the part objects (places in the L grid) those to learn."""
@@ -137,7 +136,7 @@ class SceneDataModule(lightning.LightningDataModule):
         """Scenes of a test split as they are: test_l (part objects of the training) or test_g (others)."""
         return self._unchanged(self.scenes(split))
 
-    def _unchanged(self, scenes: SceneFolder) -> DataLoader[Any]:
+    def _unchanged(self, scenes: SceneSet) -> DataLoader[Any]:
         dataset = LabelledScenes(
             scenes,
             self.part.chain,

@@ -4,21 +4,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pnet.data.scene_folder import SceneFolder
+from pnet.data.source import SceneSet
 from pnet.records import Scene, SceneId
 from pnet.scenes.noise import SensorNoise, fill_lost
 
 
 @dataclass(frozen=True)
 class NoisyScenes:
-    """A folder's scenes through a noisier sensor.
+    """Scenes through a noisier sensor.
 
     Attributes:
         scenes: as they are stored.
         noise: added to them; points that it loses are replaced by repeating others.
     """
 
-    scenes: SceneFolder
+    scenes: SceneSet
     noise: SensorNoise
 
     @property

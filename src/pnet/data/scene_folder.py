@@ -1,10 +1,8 @@
 """The scenes of one split of pnet's own store, by index."""
 
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
-
+from pnet.data.source import Keep, SceneSet
 from pnet.data.split_files import SplitFiles
 from pnet.records import Scene, SceneId
 from pnet.scenes.manifest import MANIFEST, read_manifest
@@ -12,7 +10,7 @@ from pnet.scenes.record_file import SUFFIX
 from pnet.scenes.store import CycleFile
 
 
-class SceneFolder(Sequence[Scene]):
+class SceneFolder(SceneSet):
     """All scenes of a split, read one by one.
 
     Args:
@@ -30,7 +28,7 @@ class SceneFolder(Sequence[Scene]):
         split: str,
         part: str,
         every: int = 1,
-        keep: Callable[[set[int]], set[int]] | None = None,
+        keep: Keep | None = None,
     ) -> None:
         paths = sorted((root / split).glob(f"[!.]*{SUFFIX}"))
         if not paths:
@@ -52,7 +50,7 @@ class SceneFolder(Sequence[Scene]):
         if keep is not None:
             objects = keep({file.header.part_index for file in files})
             files = [file for file in files if file.header.part_index in objects]
-        self.points_per_scene = min((file.points_per_scene for file in files if len(file)), default=0)
+        self._points = min((file.points_per_scene for file in files if len(file)), default=0)
         chosen = [list(range(len(file)))[::-1][::every][::-1] for file in files]
         self._index = chosen
         if not any(chosen):
@@ -67,14 +65,15 @@ class SceneFolder(Sequence[Scene]):
         number, file, place = self._files.locate(index)
         return file.scene(self._index[number][place])
 
-    def draw(self, index: int, rng: np.random.Generator) -> Scene:
-        """Scene `index`; nothing of it is left to chance."""
-        return self[index]
-
     @property
     def ids(self) -> list[SceneId]:
         """The scenes' ids, in order."""
         return self._ids
+
+    @property
+    def points_per_scene(self) -> int:
+        """N, the smallest of all files."""
+        return self._points
 
 
 def check_complete(root: Path, split: str, found: int, how: str = "again") -> None:

@@ -1,6 +1,6 @@
 """Where the views come from that a training sees: the stored ones, or new ones of the stored piles."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -9,7 +9,7 @@ import numpy as np
 
 from pnet.data.noisy_scenes import NoisyScenes
 from pnet.data.rendered_scenes import RenderedScenes
-from pnet.data.scene_folder import SceneFolder
+from pnet.data.source import DataSource, Keep, StoredData
 from pnet.geometry.camera import Camera
 from pnet.parts.base import ParametricPart
 from pnet.records import Scene, SceneId
@@ -18,8 +18,6 @@ from pnet.scenes.manifest import MANIFEST, read_manifest
 from pnet.scenes.noise import NoNoise, SensorNoise
 from pnet.scenes.view_factory import ViewFactory
 from pnet.scenes.viewpoints import MOST_TILT, Viewpoints
-
-Keep = Callable[[set[int]], set[int]]
 
 
 class SceneSource(Protocol):
@@ -43,13 +41,18 @@ class Views(Protocol):
     """A choice of where a training's views come from."""
 
     def open(
-        self, root: Path, part: ParametricPart, points: int | None, noise: SensorNoise, keep: Keep | None
+        self,
+        source: DataSource,
+        part: ParametricPart,
+        points: int | None,
+        noise: SensorNoise,
+        keep: Keep | None,
     ) -> SceneSource:
         """The training's scenes.
 
         Args:
-            root: the data set's folder. points: N wanted; None: as many as stored.
-            noise: of the sensor. keep: see `SceneFolder`.
+            source: the data set. points: N wanted; None: as many as stored.
+            noise: of the sensor. keep: see `DataSource`.
         """
 
 
@@ -58,16 +61,21 @@ class StoredViews:
     """Every scene as it was stored, with new noise each time."""
 
     def open(
-        self, root: Path, part: ParametricPart, points: int | None, noise: SensorNoise, keep: Keep | None
+        self,
+        source: DataSource,
+        part: ParametricPart,
+        points: int | None,
+        noise: SensorNoise,
+        keep: Keep | None,
     ) -> SceneSource:
         """See `Views`."""
-        stored = SceneFolder(root, "train", part.name, keep=keep)
+        stored = source.scenes("train", part, keep=keep)
         if isinstance(noise, NoNoise):
             return stored
-        if has_noise(root, "train"):
+        if isinstance(source, StoredData) and has_noise(source.root, "train"):
             raise ValueError(
-                f"{root}: its scenes for training have a noise already; train with noise=none, or make them "
-                "without (pnet-generate noise_in=[val,test_l,test_g])"
+                f"{source.root}: its scenes for training have a noise already; train with noise=none, or "
+                "make them without (pnet-generate noise_in=[val,test_l,test_g])"
             )
         return NoisyScenes(stored, noise)
 
@@ -101,10 +109,17 @@ class RandomViews:
         require_range("views.tilt", self.tilt, 0, MOST_TILT)
 
     def open(
-        self, root: Path, part: ParametricPart, points: int | None, noise: SensorNoise, keep: Keep | None
+        self,
+        source: DataSource,
+        part: ParametricPart,
+        points: int | None,
+        noise: SensorNoise,
+        keep: Keep | None,
     ) -> SceneSource:
         """See `Views`; the camera is the one of the stored scenes."""
-        made = read_manifest(root)
+        if not isinstance(source, StoredData):
+            raise ValueError("views=random renders piles, which data=stored alone has: use views=stored")
+        root, made = source.root, source.manifest()
         try:
             camera = Camera(**{key: value for key, value in made["camera"].items() if key != "_target_"})
             stored = int(made["protocol"]["points"])

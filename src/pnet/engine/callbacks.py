@@ -7,8 +7,8 @@ import lightning
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from pnet.engine.estimator import NetworkEstimator
 from pnet.engine.evaluation import SceneScorer
+from pnet.engine.method import NetworkMethod
 from pnet.engine.tensorboard import add_curves, add_mesh
 from pnet.records import Detections, Scene
 
@@ -24,7 +24,7 @@ class PoseValidation(lightning.Callback):
 
     def __init__(
         self,
-        estimator: NetworkEstimator,
+        estimator: NetworkMethod,
         scenes: Sequence[Scene],
         points: int | None,
         mesh_every: int,

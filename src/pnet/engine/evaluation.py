@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import torch
 
-from pnet.engine.estimator import Estimator
+from pnet.engine.method import Method
 from pnet.geometry.pose_space import PoseSpace
 from pnet.metrics.matching import ScoredPoses, TruePoses
 from pnet.metrics.pose_metric import PoseMetrics
@@ -14,7 +14,7 @@ from pnet.records import Detections, Scene
 
 
 def predict_scenes(
-    estimator: Estimator,
+    method: Method,
     scenes: Sequence[Scene],
     points: int | None,
     advance: Callable[[int], None] = lambda scenes: None,
@@ -22,13 +22,13 @@ def predict_scenes(
     """Detections of every scene.
 
     Args:
-        estimator: any method. scenes: in order. points: N, the first so many of a scene's; None: all.
+        method: any. scenes: in order. points: N, the first so many of a scene's; None: all.
         advance: called with the number of scenes done, after each.
     """
     found = []
     for index in range(len(scenes)):
         cloud = torch.from_numpy(scenes[index].points[:points])
-        found += estimator.estimate(cloud[None])
+        found += method.estimate(cloud[None])
         advance(1)
     return found
 

@@ -12,6 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from pnet.data.json_files import read_json, read_numbers, read_rotation
+from pnet.data.poseutils import read_poseutils
 from pnet.metrics.average_precision import (
     average_precision,
     best_f1,
@@ -19,7 +21,6 @@ from pnet.metrics.average_precision import (
     precision_recall_curve,
 )
 from pnet.metrics.matching import ScoredPoses, TruePoses, match_scene
-from pnet.metrics.poseutils import read_json, read_numbers, read_poseutils, read_rotation
 
 
 def score_folder(truth: Path, results: Path, poseutils: Path) -> dict[str, float]:

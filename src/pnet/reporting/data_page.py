@@ -20,7 +20,7 @@ from pnet.scenes.record_file import write_atomically
 
 MOST_SCENES = 12  # browsers keep some sixteen 3D views alive, then blank the oldest
 _STEP_BACK = 1.15  # of the camera, against a report's larger figures
-_SHEETS = """
+SHEET_STYLE = """
 .sheets { display: flex; flex-wrap: wrap; gap: 0 48px; align-items: start; }
 .sheets section { min-width: 0; max-width: 100%; overflow-x: auto; }
 .sheet tr:first-child th { border-bottom: 1px solid var(--line); }
@@ -28,6 +28,8 @@ _SHEETS = """
 .numbers td, .bars td { white-space: pre; font-size: .86rem;
   font-family: ui-monospace, "DejaVu Sans Mono", "Liberation Mono", monospace; }
 .numbers td, .numbers th + th { text-align: right; }
+"""
+_SCENES = """
 .scenes { display: grid; gap: 20px; grid-template-columns: repeat(auto-fit, minmax(min(100%, 520px), 1fr)); }
 .scenes figure { margin: 0; }
 .scenes .plot { height: 520px; }
@@ -73,7 +75,7 @@ or hide it.</p>
 <div class="scenes">
 {scenes}
 </div>"""
-    return document(content.title, body, figures, _SHEETS)
+    return document(content.title, body, figures, SHEET_STYLE + _SCENES)
 
 
 def sample_scenes(data: DataSet, splits: Sequence[str], count: int) -> list[Scene]:

@@ -15,7 +15,19 @@ from pnet.scenes.inspection import PileSummary, SplitSummary, Summary
 
 _EIGHTHS = " ▏▎▍▌▋▊▉█"
 _BAR = 5  # characters
-_SHOWN = ("part", "protocol", "bin", "physics", "clutter", "camera", "view", "noise", "noise_in", "seed")
+_SHOWN = (
+    "converted",
+    "part",
+    "protocol",
+    "bin",
+    "physics",
+    "clutter",
+    "camera",
+    "view",
+    "noise",
+    "noise_in",
+    "seed",
+)
 _UNTOLD = ("_target_", "splits", "by_part")  # the class is told first, the plan in the table of splits
 _QUANTITIES: dict[str, Callable[[SplitSummary], str]] = {
     "part objects": lambda s: f"{s.part_objects:,}",
@@ -90,7 +102,8 @@ def html_table(sheet: Sheet) -> str:
 def summary_sheets(settings: Mapping[str, Any], summary: Summary) -> list[Sheet]:
     """Everything that a summary tells, settings first."""
     sheets = [settings_sheet(settings), split_sheet(summary.splits), visibility_sheet(summary.splits)]
-    return [*sheets, coverage_sheet(summary.coverage), pile_sheet(summary.piles)]
+    sheets.append(coverage_sheet(summary.coverage))
+    return [*sheets, pile_sheet(summary.piles)] if summary.piles.planned else sheets
 
 
 def settings_sheet(settings: Mapping[str, Any]) -> Sheet:

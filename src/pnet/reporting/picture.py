@@ -1,6 +1,6 @@
 """A still picture of one scene, made without a GPU: the cloud as the camera sees it, and the estimates."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 
@@ -31,10 +31,11 @@ Points = NDArray[np.float64]
 SIZE = (1600, 900)  # pixels
 PANEL = 784  # pixels, square
 BACKGROUND = (0.055, 0.067, 0.086)
-_OVERSAMPLING = 2
+OVERSAMPLING = 2
 _SECTIONS = 72  # polygon sides of a circle
 _LIGHTS = 64  # directions of the sky
 _SHADOW_CELL = 3  # rendered pixels a side that share their shadows, which makes it several times faster
+_CHUNK = 4096  # normals that are lit together, which bounds the memory
 _NEIGHBOURS = 12  # points from which a point's normal is estimated
 _IN_FRONT = 0.003  # metres: points so far before the estimates are not explained by them
 _TEXT, _QUIET = "#e8ecf1", "#8e98a4"
@@ -53,12 +54,12 @@ def scene_picture(scene: Scene, detections: Detections, part: ParametricPart, pa
     camera = crop(scene.camera, points, np.asarray(found.mesh.vertices))
     figure = Figure(figsize=(SIZE[0] / 100, SIZE[1] / 100), dpi=100, facecolor=BACKGROUND)
     left, right = (pixel_axes(figure, (x, 64), (PANEL, PANEL)) for x in (8, SIZE[0] - PANEL - 8))
-    _draw_cloud(left, camera, points, point_colours(instance, len(detections.score)))
+    draw_cloud(left, camera, points, point_colours(instance, len(detections.score)))
     image, depth = render_bodies(camera, found, instance_colours(len(detections.score)))
     draw_image(right, image)
     _draw_unexplained(right, camera, points, depth)
     axes = estimated_axes(part, detections)
-    _draw_axes(right, camera, axes)
+    draw_axes(right, camera, axes)
     _caption(figure, *caption_texts(scene, detections, found.missing, len(axes)))
     write_png(figure, path)
 
@@ -88,27 +89,56 @@ def render_bodies(camera: Camera, bodies: Bodies, colours: Points) -> tuple[Poin
         Image (h, w, 3) in [0, 1] and planar depth (h, w), metres, inf where no body is; both larger
         than the camera's by the oversampling.
     """
-    camera, rays = _oversampled_rays(camera)
+    camera = oversampled(camera)
+    rays = pixel_rays(camera)
     image = np.tile(BACKGROUND, (len(rays), 1))
     depth = np.full(len(rays), np.inf)
     body = np.full(len(rays), -1)
-    if len(bodies.mesh.faces):
-        face = bodies.mesh.ray.intersects_first(np.zeros_like(rays), rays)
-        hit = np.flatnonzero(face >= 0)
-        normal = bodies.mesh.face_normals[face[hit]]
-        corner = bodies.mesh.triangles[face[hit], 0]
-        slope = np.einsum("nj,nj->n", normal, rays[hit])
-        depth[hit] = np.einsum("nj,nj->n", normal, corner) / np.minimum(slope, -1e-9)
-        body[hit] = bodies.face_owner[face[hit]]
-        v, u = np.divmod(hit, camera.width)
-        row = body[hit] * camera.height + v // _SHADOW_CELL
+    hits = first_hits(bodies, rays)
+    depth[hits.ray], body[hits.ray] = hits.depth, hits.body
+    if len(hits.ray):
+        v, u = np.divmod(hits.ray, camera.width)
+        row = hits.body * camera.height + v // _SHADOW_CELL
         cell = row * camera.width + u // _SHADOW_CELL
-        light = _sky_light(bodies.mesh, rays[hit] * depth[hit, None], normal, cell)
-        image[hit] = np.clip(colours[body[hit]] * light[:, None], 0, 1)
+        light = _sky_light(bodies.mesh, rays[hits.ray] * hits.depth[:, None], hits.normal, cell)
+        image[hits.ray] = np.clip(colours[hits.body] * light[:, None], 0, 1)
     shape = (camera.height, camera.width)
     image = image.reshape(*shape, 3)
-    image[_outlines(body.reshape(shape))] *= 0.35
+    image[outlines(body.reshape(shape))] *= 0.35
     return image, depth.reshape(shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """Where rays from the camera first meet bodies.
+
+    Attributes:
+        ray: (n,) int64 indices of the rays that meet one. depth: (n,) planar, metres.
+        normal: (n, 3) outwards. body: (n,) int64 the bodies' owners.
+    """
+
+    ray: NDArray[np.int64]
+    depth: Points
+    normal: Points
+    body: NDArray[np.int64]
+
+
+def first_hits(bodies: Bodies, rays: Points) -> Hits:
+    """The nearest surface along each ray.
+
+    Args:
+        bodies: camera frame, metres. rays: (r, 3) from the camera's centre, with z = 1.
+    """
+    if not len(bodies.mesh.faces):
+        none = np.zeros(0, np.int64)
+        return Hits(none, np.zeros(0), np.zeros((0, 3)), none)
+    face = bodies.mesh.ray.intersects_first(np.zeros_like(rays), rays)
+    hit = np.flatnonzero(face >= 0)
+    normal = bodies.mesh.face_normals[face[hit]]
+    corner = bodies.mesh.triangles[face[hit], 0]
+    slope = np.einsum("nj,nj->n", normal, rays[hit])
+    depth = np.einsum("nj,nj->n", normal, corner) / np.minimum(slope, -1e-9)
+    return Hits(hit, depth, normal, bodies.face_owner[face[hit]])
 
 
 def unexplained(camera: Camera, points: Points, depth: Points) -> NDArray[np.bool_]:
@@ -118,7 +148,7 @@ def unexplained(camera: Camera, points: Points, depth: Points) -> NDArray[np.boo
         camera: the view. points: (n, 3) metres. depth: as `render_bodies` gives it.
     """
     z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
-    pixels = _OVERSAMPLING * (camera.project(np.c_[points[:, :2], z]) + 0.5) - 0.5
+    pixels = OVERSAMPLING * (camera.project(np.c_[points[:, :2], z]) + 0.5) - 0.5
     column, row = np.nan_to_num(pixels, nan=-1).round().astype(np.int64).T
     inside = (column >= 0) & (row >= 0) & (column < depth.shape[1]) & (row < depth.shape[0])
     behind = np.full(len(points), np.inf)
@@ -155,10 +185,10 @@ def _sky() -> tuple[Points, Points]:
     return directions, 0.88 * weights / (weights @ height)
 
 
-def _oversampled_rays(camera: Camera) -> tuple[Camera, Points]:
-    """The same view with more pixels, and their rays (h w, 3)."""
-    n = _OVERSAMPLING
-    camera = replace(
+def oversampled(camera: Camera) -> Camera:
+    """The same view with more pixels."""
+    n = OVERSAMPLING
+    return replace(
         camera,
         width=n * camera.width,
         height=n * camera.height,
@@ -167,11 +197,15 @@ def _oversampled_rays(camera: Camera) -> tuple[Camera, Points]:
         cx=n * (camera.cx + 0.5) - 0.5,
         cy=n * (camera.cy + 0.5) - 0.5,
     )
+
+
+def pixel_rays(camera: Camera) -> Points:
+    """(h w, 3) the pixels' rays, row by row."""
     v, u = np.mgrid[: camera.height, : camera.width]
-    return camera, camera.rays(u.ravel(), v.ravel())
+    return camera.rays(u.ravel(), v.ravel())
 
 
-def _outlines(body: NDArray[np.int64]) -> NDArray[np.bool_]:
+def outlines(body: NDArray[np.int64]) -> NDArray[np.bool_]:
     """(h, w) pixels on the border between two bodies or a body and nothing."""
     border = np.zeros(body.shape, bool)
     across, down = body[:, 1:] != body[:, :-1], body[1:] != body[:-1]
@@ -182,7 +216,7 @@ def _outlines(body: NDArray[np.int64]) -> NDArray[np.bool_]:
     return border & (body >= 0)
 
 
-def _draw_cloud(axes: Axes, camera: Camera, points: Points, colours: Points) -> None:
+def draw_cloud(axes: Axes, camera: Camera, points: Points, colours: Points) -> None:
     """Points from far to near, shaded by the slope of the surface about them and by their depth."""
     shaded = np.clip(colours * _cloud_light(points)[:, None], 0, 1)
     order = np.argsort(-points[:, 2])
@@ -194,7 +228,7 @@ def _draw_unexplained(axes: Axes, camera: Camera, points: Points, depth: Points)
     _scatter(axes, camera, alone, np.tile(GREY, (len(alone), 1)), 0.4 * _spacing(camera, points))
 
 
-def _draw_axes(panel: Axes, camera: Camera, axes: Points) -> None:
+def draw_axes(panel: Axes, camera: Camera, axes: Points) -> None:
     """Lines (a, 3, 2, 3) of the estimates that have no solid, the nearest last."""
     before = axes[(axes[..., 2] > 0).all((1, 2))]
     for lines in before[np.argsort(-before[:, 0, 0, 2])]:
@@ -222,16 +256,30 @@ def _cloud_light(points: Points) -> Points:
     """(n,) brightness: towards the light brighter, deeper darker."""
     if not len(points):
         return np.zeros(0)
-    z = points[:, 2]
-    nearness = (np.quantile(z, 0.98) - z) / max(float(np.ptp(z)), 1e-6)
     neighbours = cKDTree(points).query(points, min(_NEIGHBOURS, len(points)))[1]
     around = points[neighbours.reshape(len(points), -1)]
     around = around - around.mean(1, keepdims=True)
     normal = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][:, :, 0]
     normal *= -np.sign(normal[:, 2:] + 1e-12)  # towards the camera
+    return surface_light(normal, points[:, 2])
+
+
+def surface_light(normal: Points, z: Points) -> Points:
+    """(n,) brightness of places on a surface under the open sky: towards the light brighter, deeper darker.
+
+    Args:
+        normal: (n, 3) towards the camera. z: (n,) depth, metres; at least one.
+    """
+    nearness = (np.quantile(z, 0.98) - z) / max(float(np.ptp(z)), 1e-6)
+    return (0.16 + open_sky(normal)) * (0.7 + 0.35 * np.clip(nearness, 0, 1))
+
+
+def open_sky(normal: Points) -> Points:
+    """(n,) light of the whole sky on surfaces with normals (n, 3), nothing in the way."""
     directions, weights = _sky()
-    sky = np.clip(normal @ directions.T, 0, None) @ weights
-    return (0.16 + sky) * (0.7 + 0.35 * np.clip(nearness, 0, 1))
+    chunks = (normal[i : i + _CHUNK] for i in range(0, len(normal), _CHUNK))
+    light = [np.clip(chunk @ directions.T, 0, None) @ weights for chunk in chunks]
+    return np.concatenate([np.zeros(0), *light])
 
 
 def pixel_axes(figure: Figure, corner: tuple[int, int], size: tuple[int, int]) -> Axes:
@@ -249,10 +297,10 @@ def pixel_axes(figure: Figure, corner: tuple[int, int], size: tuple[int, int]) -
     return axes
 
 
-def draw_image(axes: Axes, image: Points) -> None:
-    """Fill `pixel_axes` with an image (h, w, 3) in [0, 1] of any resolution."""
+def draw_image(axes: Axes, image: Points, above: bool = False) -> None:
+    """Fill `pixel_axes` with an image (h, w, 3 or 4) in [0, 1] of any resolution; above: over points."""
     extent = (*axes.get_xlim(), *axes.get_ylim())
-    axes.imshow(image, extent=extent, interpolation="antialiased")
+    axes.imshow(image, extent=extent, interpolation="antialiased", zorder=1.5 if above else 0)
 
 
 def write_png(figure: Figure, path: Path) -> None:

@@ -87,8 +87,13 @@ def estimated_axes(part: ParametricPart, detections: Detections) -> Points:
     poses = (detections.R, detections.t, detections.parameters)
     R, t, parameters = (tensor.detach().double().cpu().numpy() for tensor in poses)
     shown = np.isnan(parameters).all(1) & np.isfinite(R).all((1, 2)) & np.isfinite(t).all(1)
-    origin = np.repeat(t[shown][:, None], 3, 1)
-    return np.stack([origin, origin + part.grids["L"].mean(0).max() * R[shown].swapaxes(1, 2)], 2)
+    return pose_axes(part, R[shown], t[shown])
+
+
+def pose_axes(part: ParametricPart, R: Points, t: Points) -> Points:
+    """(a, 3, 2, 3) lines as of `estimated_axes` for poses R (a, 3, 3), t (a, 3)."""
+    origin = np.repeat(t[:, None], 3, 1)
+    return np.stack([origin, origin + part.grids["L"].mean(0).max() * R.swapaxes(1, 2)], 2)
 
 
 def instance_colours(count: int) -> Points:
@@ -334,9 +339,9 @@ def _notes(points: int, detections: Detections, missing: int, sizeless: int) -> 
 def _solid(part: ParametricPart, parameters: Points) -> trimesh.Trimesh | None:
     try:
         part.check_named(parameters)
+        return part.mesh(parameters)
     except ValueError:  # an early network may estimate parameters that describe no solid
         return None
-    return part.mesh(parameters)
 
 
 def _columns(points: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:

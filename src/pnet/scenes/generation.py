@@ -5,14 +5,9 @@ Piles lie in a folder of their own: `simulate` makes them, `render` makes scenes
 """
 
 import json
-import os
-import signal
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
-from multiprocessing import get_context, parent_process
 from pathlib import Path
-from threading import Thread
 from time import perf_counter
 from typing import Any
 
@@ -22,6 +17,7 @@ from pnet.scenes.pile_store import PileFile, write_piles
 from pnet.scenes.protocol import CycleTask
 from pnet.scenes.record_file import SUFFIX, remove_left_overs, write_atomically
 from pnet.scenes.store import CycleFile, write_cycle
+from pnet.scenes.workers import in_parallel
 
 STAGES = ("simulate", "render", "all")
 
@@ -191,7 +187,7 @@ def generate(plan: Plan, tasks: Iterable[CycleTask], workers: int) -> Iterator[C
         for task in missing:
             yield plan.make(task)
         return
-    yield from _in_parallel(plan, missing, workers)
+    yield from in_parallel(plan, missing, workers, _roots(plan))
 
 
 def _check_piles_there(plan: Plan, tasks: list[CycleTask]) -> None:
@@ -204,63 +200,8 @@ def _check_piles_there(plan: Plan, tasks: list[CycleTask]) -> None:
         )
 
 
-def _in_parallel(plan: Plan, tasks: list[CycleTask], workers: int) -> Iterator[CycleReport]:
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (plan,))
-    waiting = iter(tasks)
-    running: set[Future[CycleReport]] = set()
-    try:
-        while True:
-            # a short queue, so that an interruption has little to wait for
-            for task in waiting:
-                running.add(pool.submit(_make_in_worker, task))
-                if len(running) >= 2 * workers:
-                    break
-            if not running:
-                return
-            done, running = wait(running, return_when=FIRST_COMPLETED)
-            for future in done:
-                yield future.result()
-    except BrokenExecutor as fault:
-        raise OSError(
-            "a worker process was killed (out of memory?); the same command goes on, workers=1 needs less"
-        ) from fault
-    finally:
-        processes = list((pool._processes or {}).values())
-        pool.shutdown(wait=not running, cancel_futures=True)
-        for process in processes if running else []:
-            process.terminate()
-            process.join()
-            for root in _roots(plan):
-                remove_left_overs(root, process.pid)
-
-
-def _roots(plan: Plan) -> Sequence[Path]:
+def _roots(plan: Plan) -> list[Path]:
     return [root for root in (plan.piles, plan.scenes) if root.is_dir()]
-
-
-def _start_worker(plan: Plan) -> None:
-    import torch
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
-    signal.signal(signal.SIGTERM, lambda *_: os._exit(1))
-    torch.set_num_threads(1)
-    Thread(target=_end_with_parent, daemon=True).start()
-    _worker["plan"] = plan
-
-
-def _end_with_parent() -> None:
-    """A worker whose parent was killed would wait for its next task for ever."""
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-_worker: dict[str, Plan] = {}  # what a worker process was started with
-
-
-def _make_in_worker(task: CycleTask) -> CycleReport:
-    return _worker["plan"].make(task)
 
 
 def _made_by(reader: type[CycleFile] | type[PileFile], path: Path) -> str | None:

@@ -32,7 +32,8 @@ class DataSet:
 
     Attributes:
         root, piles: the folders of its scenes and of its piles.
-        part: what lies there. protocol: its plan for this part. tasks: every file that it plans.
+        part: what lies there. protocol: its plan for this part; None: converted from another data set,
+            without piles. tasks: every file that is planned.
         fingerprint, piles_fingerprint: what the header of every file of scenes and of piles must say.
         files: how many files of each split the manifest speaks of.
     """
@@ -40,7 +41,7 @@ class DataSet:
     root: Path
     piles: Path
     part: ParametricPart
-    protocol: Protocol
+    protocol: Protocol | None
     tasks: Sequence[CycleTask]
     fingerprint: str
     piles_fingerprint: str
@@ -144,8 +145,8 @@ def summarise(data: DataSet, advance: Advance = lambda files: None) -> Summary:
 
 def summarise_piles(data: DataSet) -> PileSummary:
     """Count the files of piles by their headers."""
-    found = PileSummary(planned=len(data.tasks))
-    for task in data.tasks:
+    found = PileSummary(planned=len(data.tasks) if data.protocol else 0)
+    for task in data.tasks if data.protocol else []:
         path = data.pile_path(task)
         if not path.is_file():
             found.missing += 1

@@ -16,11 +16,12 @@ class Sharing:
     """Looks at every file of a data set, one after another.
 
     Args:
-        part: what lies there. protocol: which grid a split's part objects are of.
+        part: what lies there. protocol: which grid a split's part objects are of; None: converted data, whose
+            splits number their cycles apart.
     """
 
-    def __init__(self, part: ParametricPart, protocol: Protocol) -> None:
-        self._part, self._splits = part, protocol.splits
+    def __init__(self, part: ParametricPart, protocol: Protocol | None) -> None:
+        self._part, self._protocol = part, protocol
         self._cycles: dict[tuple[object, ...], Path] = {}
         self._poses: dict[bytes, Path] = {}
         self._objects: dict[str, dict[tuple[float, ...], Path]] = {}
@@ -29,8 +30,10 @@ class Sharing:
     def see(self, path: Path, file: CycleFile, scenes: list[Scene]) -> None:
         """Take note of a file in its split's folder."""
         header, split = file.header, path.parent.name
-        grid = self._splits[split].grid if split in self._splits else None
-        self._note(self._cycles, (grid, header.part_index, header.cycle, header.kind), path, "is the cycle")
+        if self._protocol is not None:
+            plan = self._protocol.splits.get(split)
+            key = (plan and plan.grid, header.part_index, header.cycle, header.kind)
+            self._note(self._cycles, key, path, "is the cycle")
         if not scenes:
             return
         digest = sha256(b"".join(scene.R.tobytes() + scene.t.tobytes() for scene in scenes)).digest()

@@ -74,7 +74,8 @@ def verify(data: DataSet, advance: Advance = lambda files: None) -> Verification
         sharing.see_extra(path)
     found.faults += [Fault(path, text, LASTING) for path, text in sharing.faults()]
     for task in data.tasks:
-        check_piles(data, task, found)
+        if data.protocol is not None:
+            check_piles(data, task, found)
         advance(1)
     for path in data.extra_files(data.piles) if data.piles.is_dir() else []:
         found.faults.append(Fault(path, "not of this data set's plan; move it away", LASTING))
@@ -149,12 +150,15 @@ def _add(found: Verification, path: Path, wrong: list[str]) -> None:
 
 
 def _scene_header_faults(data: DataSet, task: CycleTask, file: CycleFile) -> Iterator[str]:
-    header, planned = file.header, data.protocol.scene_drops()
+    header = file.header
     yield from _place_faults(header, task, ("split", "kind", "cycle", "part_index"))
     if header.fingerprint != data.fingerprint:
         yield f"made with other settings than {MANIFEST} says"
     if header.part != data.part.name:
         yield f"shows {header.part}, not {data.part.name}"
+    if data.protocol is None:
+        return
+    planned = data.protocol.scene_drops()
     if not set(header.drops) <= set(planned) or list(header.drops) != sorted(set(header.drops)):
         yield f"holds scenes after {list(header.drops)} drops, which the protocol does not plan"
     if len(file) + header.empty != len(planned):
@@ -164,6 +168,7 @@ def _scene_header_faults(data: DataSet, task: CycleTask, file: CycleFile) -> Ite
 
 
 def _pile_header_faults(data: DataSet, task: CycleTask, file: PileFile) -> Iterator[str]:
+    assert data.protocol is not None  # else there are no piles
     header, planned = file.header, data.protocol.scene_drops()
     yield from _place_faults(header, task, ("split", "kind", "grid", "cycle", "part_index"))
     if header.fingerprint != data.piles_fingerprint:
@@ -183,13 +188,14 @@ def _place_faults(header: object, task: CycleTask, names: tuple[str, ...]) -> It
 
 
 def _scene_faults(data: DataSet, task: CycleTask, scenes: list[Scene]) -> Iterator[str]:
-    parameters = data.part.part_object(task.grid, task.part_index)
     for scene in scenes:
-        for text in _array_faults(scene, parameters):
+        # sizes that were read from elsewhere need not be those of the part's grids
+        planned = None if data.protocol is None else data.part.part_object(task.grid, task.part_index)
+        for text in _array_faults(scene, planned):
             yield f"scene {scene.id.drop:03d}: {text}"
 
 
-def _array_faults(scene: Scene, parameters: NDArray[np.float64]) -> Iterator[str]:
+def _array_faults(scene: Scene, parameters: NDArray[np.float64] | None) -> Iterator[str]:
     for name in _ARRAYS:
         if not np.isfinite(getattr(scene, name)).all():
             yield f"{name} is not finite"
@@ -200,7 +206,7 @@ def _array_faults(scene: Scene, parameters: NDArray[np.float64]) -> Iterator[str
     for name in ("visibility", "occlusion"):
         if (np.abs(getattr(scene, name) - 0.5) > 0.5 + _ROUNDING).any():
             yield f"{name} is outside of 0 to 1"
-    if not _are_close(scene.parameters, parameters):
+    if parameters is not None and not _are_close(scene.parameters, parameters):
         yield "parameters are not the part object's"
 
 

@@ -1,4 +1,4 @@
-"""What evaluation, prediction and tables know of a method: scenes in, detections out."""
+"""What evaluation, prediction and tables know of a method: clouds in, detections out."""
 
 from dataclasses import dataclass, field
 from time import perf_counter
@@ -21,7 +21,7 @@ class Timing:
     postprocess: float = 0.0
 
 
-class Estimator(Protocol):
+class Method(Protocol):
     """Finds the instances of a part in point clouds; learned or classical."""
 
     part: ParametricPart
@@ -43,7 +43,7 @@ class Recovery(Protocol):
 
 
 @dataclass
-class NetworkEstimator:
+class NetworkMethod:
     """A trained network and the recovery of poses from its predictions.
 
     Attributes:

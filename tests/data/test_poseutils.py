@@ -8,6 +8,7 @@ import pytest
 import roma
 import torch
 
+from pnet.data.poseutils import read_poseutils, write_poseutils
 from pnet.geometry.pose_space import PoseSpace
 from pnet.geometry.symmetry import (
     FiniteSymmetry,
@@ -15,7 +16,6 @@ from pnet.geometry.symmetry import (
     SphericalSymmetry,
     dihedral,
 )
-from pnet.metrics.poseutils import read_poseutils, write_poseutils
 
 FINITE = {
     "type": "AffinePoseUtils",

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import roma
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from pnet.data.json_files import check_rotations, read_json, read_numbers, read_rotation
 from pnet.geometry.pose_space import PoseSpace
 from pnet.geometry.symmetry import (
     FiniteSymmetry,
@@ -23,7 +23,6 @@ from pnet.geometry.symmetry import (
 )
 from pnet.scenes.record_file import write_atomically
 
-ROTATION_TOLERANCE = 1e-3
 _FINITE, _REVOLUTION, _SPHERE = "AffinePoseUtils", "RevolutionPoseUtils", "SphericalPoseUtils"
 
 
@@ -64,60 +63,6 @@ def write_poseutils(path: Path, space: PoseSpace) -> None:
     write_atomically(path, (json.dumps(fields, indent=2) + "\n").encode())
 
 
-def read_json(path: Path) -> Any:
-    """Parse a file; ValueError names it."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: is not valid JSON: {error}") from error
-
-
-def read_numbers(
-    fields: dict[str, Any], key: str, where: str, *shapes: tuple[int, ...]
-) -> NDArray[np.float64]:
-    """Finite numbers out of a JSON object.
-
-    Args:
-        where: file and entry, for the error.
-        shapes: those allowed; −1 stands for any length.
-    """
-    if key not in fields:
-        raise ValueError(f"{where}: key {key!r} is missing")
-    expected = " or ".join(map(str, shapes)).replace("-1", "n")
-    try:
-        value = np.asarray(fields[key])
-    except ValueError:
-        raise ValueError(f"{where}: key {key!r} is ragged, expected shape {expected}") from None
-    if value.dtype.kind not in "iuf":
-        raise ValueError(f"{where}: key {key!r} does not hold numbers of shape {expected}")
-    if not any(_fits(value.shape, shape) for shape in shapes):
-        raise ValueError(f"{where}: key {key!r} has shape {value.shape}, expected {expected}")
-    if not np.isfinite(value).all():
-        raise ValueError(f"{where}: key {key!r} holds NaN or infinity")
-    return value.astype(np.float64)
-
-
-def read_rotation(fields: dict[str, Any], key: str, where: str) -> NDArray[np.float64]:
-    """A (3, 3) rotation out of a JSON object."""
-    R = read_numbers(fields, key, where, (3, 3))
-    _check_rotations(R, key, where)
-    return R
-
-
-def _fits(shape: tuple[int, ...], pattern: tuple[int, ...]) -> bool:
-    return len(shape) == len(pattern) and all(p in (-1, n) for n, p in zip(shape, pattern, strict=True))
-
-
-def _check_rotations(R: NDArray[np.float64], key: str, where: str) -> None:
-    """R: (..., 3, 3)."""
-    gap = np.abs(R @ R.swapaxes(-1, -2) - np.eye(3)).max()
-    if gap > ROTATION_TOLERANCE or (np.linalg.det(R) < 0).any():
-        raise ValueError(
-            f"{where}: key {key!r} is not a rotation (R Rᵀ is off the identity by {gap:.2g}, "
-            f"smallest determinant {np.linalg.det(R).min():.2g})"
-        )
-
-
 def _symmetry_and_scale(fields: dict[str, Any], where: str) -> tuple[Symmetry, Tensor]:
     match fields.get("type"):
         case "AffinePoseUtils":
@@ -137,7 +82,7 @@ def _symmetry_and_scale(fields: dict[str, Any], where: str) -> tuple[Symmetry, T
 
 def _read_group(fields: dict[str, Any], where: str) -> FiniteSymmetry:
     values = read_numbers(fields, "G", where, (-1, 3, 3))
-    _check_rotations(values, "G", where)
+    check_rotations(values, "G", where)
     # printed digits leave the rotations slightly off, the group check is strict
     G = roma.special_procrustes(torch.from_numpy(values))
     gap = (G - torch.eye(3, dtype=G.dtype)).abs().amax((-1, -2))

@@ -1,0 +1,22 @@
+"""Detections in the frames of the Siléane data set, for its benchmark."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from pnet.data.public.sileane import SileaneData
+from pnet.data.public.sileane_camera import read_camera
+from pnet.records import Detections
+
+
+def world_detections(data: SileaneData, found: Detections) -> Detections:
+    """Detections with poses object → world, metres, as the data set gives its own.
+
+    Args:
+        data: the data set. found: in one of its scenes, part → camera.
+    """
+    camera = read_camera(Path(data.root) / "camera_params.txt")
+    R, t = data.frame.object_poses(found.R.cpu().double().numpy(), found.t.cpu().double().numpy())
+    R, t = camera.R @ R, t @ camera.R.T + camera.t
+    return replace(found, R=torch.from_numpy(R), t=torch.from_numpy(t))
