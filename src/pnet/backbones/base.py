@@ -13,10 +13,12 @@ class Backbone(nn.Module, ABC):
     Attributes:
         features: F, channels of the output. pyramid: the neighbour tables that it needs and that depend on
             one cloud alone, so that a data loader can find them; None: nothing of the kind.
+        batches_agree: whether a cloud's features are the same in any batch (in evaluation, up to rounding).
     """
 
     features: int
     pyramid: Pyramid | None = None
+    batches_agree: bool = True
 
     def tables(self, points: Tensor) -> Tables:
         """Neighbour tables of clouds; found once, outside autograd. One that overrides this has no `pyramid`.

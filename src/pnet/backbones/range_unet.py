@@ -30,6 +30,8 @@ class RangeUNet(Backbone):
         features: F.
     """
 
+    batches_agree = False
+
     def __init__(
         self,
         channels: Sequence[int],

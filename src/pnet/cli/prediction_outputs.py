@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pnet.engine.depth_estimator import Estimate
     from pnet.records import Scene
 
-DONE = "done.json"  # in the output folder: which images have results, and of what
+DONE = ".pnet-predict"  # in the output folder: which images have results, and of what; no result itself
 
 
 class Done:
@@ -75,7 +75,8 @@ class Writer:
     """
 
     def __init__(self, cfg: DictConfig, output: Path, alone: bool) -> None:
-        self._picture, self._page = bool(cfg.picture), alone if cfg.page is None else bool(cfg.page)
+        wishes = (cfg.picture, cfg.page)
+        self._picture, self._page = (alone if wish is None else bool(wish) for wish in wishes)
         self._output, self._run = output, str(cfg.run)
 
     def write(self, prepared: "Prepared", estimate: "Estimate") -> dict[str, float]:

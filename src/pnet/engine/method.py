@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
+from pnet.backbones.base import Backbone
 from pnet.parts.base import ParametricPart
 from pnet.postprocess.pipeline import no_detections
 from pnet.records import Detections
@@ -65,6 +66,17 @@ class NetworkMethod:
         device = next(self.network.parameters()).device
         training = self.network.training
         self.network.eval()
+        # one by one, where a batch saves no time or its clouds would change each other's results
+        backbones = [module for module in self.network.modules() if isinstance(module, Backbone)]
+        alone = device.type == "cpu" or not all(backbone.batches_agree for backbone in backbones)
+        found: list[Detections] = []
+        for batch in points.split(1 if alone else len(points)):
+            found += self._estimate(batch, device)
+        self.timing.scenes += len(points)
+        self.network.train(training)
+        return found
+
+    def _estimate(self, points: Tensor, device: torch.device) -> list[Detections]:
         start = perf_counter()
         with torch.autocast(device.type, torch.bfloat16, enabled=self.bf16):
             prediction = self.network(points.to(device))
@@ -74,8 +86,6 @@ class NetworkMethod:
         found = [self.recovery(self.part, prediction, i, points[i]) for i in range(len(points))]
         self.timing.network += middle - start
         self.timing.postprocess += perf_counter() - middle
-        self.timing.scenes += len(points)
-        self.network.train(training)
         return found
 
 
