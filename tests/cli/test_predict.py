@@ -143,6 +143,71 @@ def test_a_bad_image_is_told_at_the_end_and_the_others_are_predicted(smoke, imag
     assert {path.stem for path in (tmp_path / "out").glob("*.csv")} == {"1", "2"}
 
 
+def test_results_never_take_the_place_of_what_they_are_made_from(smoke, images, run_here, tmp_path):
+    np.save(tmp_path / "0.npy", np.load(images / "0.npy"))
+    depth = np.nan_to_num(np.load(images / "2.npy"))
+    Image.fromarray(np.rint(1000 * depth).astype(np.uint16)).save(tmp_path / "bin.png")
+    before = (tmp_path / "bin.png").read_bytes()
+    for given in (tmp_path / "bin.png", tmp_path):
+        outcome = run_here(
+            smoke.folder, "predict", "run=outputs/run", f"input={given}", f"output={tmp_path}", "picture=true"
+        )
+        assert "bin.png would be written over; choose another folder" in outcome.error
+    (tmp_path / "0.json").write_text(json.dumps(vars(pnet.Estimator.load(smoke.run).camera)))
+    outcome = run_here(
+        smoke.folder, "predict", "run=outputs/run", f"input={tmp_path}/0.npy", f"output={tmp_path}",
+        f"camera={tmp_path}/0.json",
+    )  # fmt: skip
+    assert "0.json would be written over" in outcome.error
+    assert (tmp_path / "bin.png").read_bytes() == before
+
+
+def test_another_camera_in_the_same_file_makes_results_anew(smoke, images, run_here, tmp_path):
+    camera = vars(pnet.Estimator.load(smoke.run).camera)
+    words = (
+        "run=outputs/run", f"input={images}", f"output={tmp_path}/out", f"camera={tmp_path}/camera.json"
+    )  # fmt: skip
+    for fx, made in (
+        (375.0, "3 images predicted:"),
+        (375.0, "3 had results"),
+        (300.0, "3 images predicted:"),
+    ):
+        (tmp_path / "camera.json").write_text(json.dumps({**camera, "fx": fx}))
+        assert made in run_here(smoke.folder, "predict", *words).out
+
+
+def test_floating_point_images_are_metres_whatever_a_camera_file_says_of_integers(smoke, depths, tmp_path):
+    from pnet.cli.prediction_inputs import DepthCoding, Reading
+    from pnet.data.camera_files import read_camera
+
+    (tmp_path / "camera_params.txt").write_text(
+        "width 160\nheight 128\nfu 375\nfv 375\ncu 79.5\ncv 63.5\nclip_start 0.3\nclip_end 1\n"
+    )
+    file = read_camera(tmp_path / "camera_params.txt")
+    coding = DepthCoding(file.depth_scale / 1000, file.depth_offset, of_integers=True)
+    np.save(tmp_path / "metres.npy", depths[2])
+    codes = np.rint((np.nan_to_num(depths[2], nan=1.0) - 0.3) / 0.7 * 65535).astype(np.uint16)
+    np.save(tmp_path / "codes.npy", codes)
+    estimator = pnet.Estimator.load(smoke.run)
+    reading = Reading("depth", file.camera, coding, "m")
+    one, two = (reading.prepare(tmp_path / f"{name}.npy", estimator).depth for name in ("metres", "codes"))
+    np.testing.assert_array_equal(one, depths[2])
+    np.testing.assert_allclose(two, depths[2], atol=0.7 / 65535)
+
+
+def test_text_files_of_a_folder_are_clouds_only_where_that_is_said(tmp_path):
+    for name in ("a.png", "README.txt", "empty.png", "b.xyz"):
+        (tmp_path / name).touch()
+    found = find_inputs(tmp_path, others=[tmp_path / "empty.png"])
+    assert [path.name for path in found] == ["a.png", "b.xyz"]
+    assert [path.name for path in find_inputs(tmp_path, "cloud")] == [
+        "README.txt",
+        "a.png",
+        "b.xyz",
+        "empty.png",
+    ]
+
+
 def test_an_empty_image_says_that_nothing_was_found(smoke, run_here, tmp_path):
     np.save(tmp_path / "empty.npy", np.full((128, 160), np.nan))
     outcome = run_here(
@@ -193,6 +258,8 @@ def test_a_cloud_is_found_like_its_image(smoke, tn34_scenes, run_here, tmp_path,
             ["input=outputs", "camera=ensenso_n53"],
             "camera=ensenso_n53: neither a file nor a choice, did you mean ensenso_n35",
         ),
+        (["input=outputs", "threads=0"], "threads=0: expected a whole number of at least 1"),
+        (["input=outputs", "picture=maybe"], "picture=maybe: expected true, false or null"),
         (["input=outputs", "batch=0"], "batch=0: expected a whole number of at least 1"),
         (["input=outputs", "kind=dept"], "kind=dept"),
         (["input=outputs", "device=gpu"], "device=gpu: choose auto, cpu, cuda"),
@@ -232,6 +299,38 @@ def test_a_bundle_alone_predicts_what_its_run_predicts(smoke, bundle, depths, tm
     for name in ("R", "t", "score"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
     assert [path.name for path in alone.parent.iterdir()] == ["x.pnet"]
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda s: s.update(part="x"), "part"),
+        (lambda s: s.update(trainer={}), "precision"),
+        (lambda s: s["backbone"].update(nonsense=1), "nonsense"),
+        (lambda s: s["backbone"].update(_target_="os.system"), "not allowed"),
+        (lambda s: s.pop("model"), "lack model"),
+        (lambda s: s["model"].update(hidden=[7]), "do not fit"),
+    ],
+)
+def test_a_bundle_of_other_settings_is_an_error_that_names_it(bundle, tmp_path, change, text):
+    from pnet.engine.bundle import read_bundle, write_bundle
+
+    spoilt = read_bundle(bundle)
+    change(spoilt.settings)
+    write_bundle(tmp_path / "x.pnet", spoilt)
+    with pytest.raises(ValueError) as fault:
+        pnet.Estimator.load(tmp_path / "x.pnet")
+    assert "x.pnet" in str(fault.value) and text in str(fault.value), fault.value
+
+
+def test_a_bundle_cannot_write_outside_of_its_folder(bundle, tmp_path):
+    from dataclasses import replace
+
+    from pnet.engine.bundle import read_bundle, write_bundle
+
+    write_bundle(tmp_path / "x.pnet", replace(read_bundle(bundle), files={"../evil.stl": b"x"}))
+    with pytest.raises(ValueError, match="no plain name"):
+        pnet.Estimator.load(tmp_path / "x.pnet")
 
 
 def test_a_bundle_takes_another_camera_along(smoke, run_here, tmp_path):

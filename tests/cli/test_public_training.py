@@ -2,6 +2,7 @@
 the paper's own data."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +101,22 @@ def test_results_are_named_and_framed_as_the_benchmark_has_it(run, folders, run_
     assert scored["AP"] == pytest.approx(metrics["AP"], abs=1e-9)
 
 
+def test_training_on_the_siléane_data_takes_splits_as_documented(folders, run_here):
+    text = (Path(__file__).parents[2] / "docs" / "public_data.md").read_text(encoding="utf-8")
+    documented = re.search(r"'(data\.source\.splits=[^']*)'", text)
+    splits = documented.group(1).replace("[0]", "[1]", 2).replace("test_l: [1]", "test_l: [2]")
+    outcome = run_here(
+        folders, "train", "part=gear", *SHORT, "data=sileane", "data.root=sileane", "data.source.points=512",
+        splits, "run_dir=sil",
+    )  # fmt: skip
+    assert outcome.code == 0, outcome
+    assert json.loads((folders / "sil" / "dataset.json").read_text())["scenes"] == {
+        "test_l": 2, "train": 2, "val": 2,
+    }  # fmt: skip
+    bundled = run_here(folders, "export", "run=sil", "output=sil.pnet")
+    assert bundled.code == 0 and "camera kept" in bundled.out
+
+
 def test_a_run_is_evaluated_and_reported_on_another_public_set(run, folders, run_here):
     words = (
         "data=sileane",
@@ -109,10 +126,12 @@ def test_a_run_is_evaluated_and_reported_on_another_public_set(run, folders, run
     )
     outcome = run_here(folders, "evaluate", "run=run", *words, "threads=1")
     assert outcome.code == 0, outcome
-    assert json.loads((run / "evaluation" / "test_l_sileane" / "metrics.json").read_text())["scenes"] == 2
-    outcome = run_here(folders, "report", "run=run", "evaluation=test_l_sileane", *words)
+    (folder,) = (run / "evaluation").glob("test_l_sileane_SileaneData-*")
+    assert json.loads((folder / "metrics.json").read_text())["scenes"] == 2
+    assert f"next: pnet-report run=run evaluation={folder.name} data=sileane" in outcome.out
+    outcome = run_here(folders, "report", "run=run", f"evaluation={folder.name}", *words)
     assert outcome.code == 0 and (run / "report" / "report.html").is_file(), outcome
-    error = run_here(folders, "report", "run=run", "evaluation=test_l_sileane").error
+    error = run_here(folders, "report", "run=run", f"evaluation={folder.name}").error
     assert "is not the data that the predictions were made from" in error
 
 

@@ -290,3 +290,10 @@ def test_every_config_has_the_defaults_of_its_class(name, kind, given):
     fields = OmegaConf.to_container(node)
     assert fields.pop("_target_") == f"{kind.__module__}.{kind.__qualname__}"
     assert kind(**fields) == kind(**given)
+
+
+def test_an_empty_bin_of_another_scale_is_told_and_not_taken_for_one_far_away(tmp_path):
+    Image.fromarray(np.full((TINY.height, TINY.width), 6500, np.uint16)).save(tmp_path / "empty.png")
+    points, pixels = np.tile([0.0, 0.0, 0.6], (3, 1)), np.arange(3)
+    with pytest.raises(ValueError, match=r"empty.png: the median depth is 65 m.*background[.]scale"):
+        EmptyBin(str(tmp_path / "empty.png"), scale=0.01)(points, pixels, TINY)

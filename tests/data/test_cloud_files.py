@@ -431,7 +431,7 @@ def test_a_missing_file_and_an_unknown_unit_are_errors(tmp_path):
     ("z", "message"),
     [
         ([-0.5, -0.6, 0.7], r"most points lie behind the camera .z from -0.6 to 0.7 m."),
-        ([600, 700, 0.7], "median depth is 600 m, expected 0.001 to 50 m; set unit="),
+        ([600, 700, 0.7], "median depth is 600 m, expected 0.001 to 50 m; set cloud.unit="),
         ([0.0006, 0.0007, 0.7], "median depth is 0.0007 m"),
     ],
 )

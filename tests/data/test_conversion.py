@@ -95,6 +95,16 @@ def test_what_is_there_is_kept_and_what_is_gone_is_made_again(source, tn34, tmp_
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.safetensors")} == before
 
 
+def test_splits_may_be_converted_one_after_the_other(source, tn34, tmp_path):
+    plan = plan_conversion(source, tn34, tmp_path)
+    manifest = conversion_manifest(plan, {"name": "tn34"})
+    assert [cycle.split for cycle, _ in convert(plan, manifest, 0, ["test_l"])] == ["test_l"]
+    assert len(StoredData(tmp_path).scenes("test_l", tn34)) == 2
+    with pytest.raises(FileNotFoundError, match="train"):
+        StoredData(tmp_path).scenes("train", tn34)
+    assert [report is None for _, report in convert(plan, manifest, 0)] == [True, False, False]
+
+
 def test_another_source_does_not_mix_with_the_store(source, make_scene, tn34, tmp_path):
     run(source, tn34, tmp_path)
     with pytest.raises(ValueError, match=r"converted\.name was 'made', now 'other'"):

@@ -52,10 +52,19 @@ def test_the_scale_is_in_metres_a_unit(tmp_path):
     np.testing.assert_allclose(depth, [[0.065, NAN, 0.07], [NAN, 0.0001, 3.0]], rtol=1e-12)
 
 
-def test_the_offset_is_added_in_metres_to_what_was_measured(tmp_path):
+def test_a_coding_of_integers_leaves_floating_point_numbers_alone(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([[0.65, 0.0], [0.7, 0.8]]))
+    depth = read_depth(tmp_path / "a.npy", scale=0.0001, offset=0.5, missing=[0.7], of_integers=True)
+    np.testing.assert_array_equal(depth, [[0.65, NAN], [0.7, 0.8]])
+    write_png16(tmp_path / "a.png", MILLIMETRES)
+    coded = read_depth(tmp_path / "a.png", scale=0.0001, offset=0.5, of_integers=True)
+    np.testing.assert_array_equal(coded, read_depth(tmp_path / "a.png", scale=0.0001, offset=0.5))
+
+
+def test_the_offset_is_added_in_metres_to_what_was_measured_and_0_is_a_depth_then(tmp_path):
     write_png16(tmp_path / "a.png", MILLIMETRES)
     depth = read_depth(tmp_path / "a.png", scale=0.0001, offset=0.5)
-    np.testing.assert_allclose(depth, [[0.565, NAN, 0.57], [NAN, 0.5001, 3.5]], rtol=1e-12)
+    np.testing.assert_allclose(depth, [[0.565, 0.5, 0.57], [NAN, 0.5001, 3.5]], rtol=1e-12)
     depth = read_depth(tmp_path / "a.png", offset=-0.66)  # nothing is measured behind the camera
     np.testing.assert_allclose(depth, [[NAN, NAN, 0.04], [NAN, NAN, 29.34]], rtol=1e-12)
 
@@ -154,7 +163,7 @@ def test_a_distance_along_the_ray_becomes_planar_depth(tmp_path):
     ("array", "arguments", "message"),
     [
         (np.float32([[1, -0.5]]), {}, r"negative depths \(lowest -0.5\)"),
-        (np.uint8([[1]]), {}, "8 bits.*set scale="),
+        (np.uint8([[1]]), {}, "8 bits.*set depth.scale="),
         (np.uint16([[1]]), {"scale": 0}, "scale is 0, expected more than 0"),
         (np.uint16([[1]]), {"offset": NAN}, "offset is nan"),
         (np.uint16([[1]]), {"scale": NAN}, "scale is nan, expected more than 0"),
@@ -179,9 +188,9 @@ def test_a_negative_value_may_mean_missing(tmp_path):
     ("depth", "message"),
     [
         ([NAN, NAN], "no pixel was measured"),
-        ([650.0, 700, NAN], "median depth is 675 m.*set scale="),
-        ([0.00065], "median depth is 0.00065 m.*set scale="),
-        ([0.05, 11], r"from 0.05 to 11 m, none lies within the camera's 0.1 to 10 m; set scale="),
+        ([650.0, 700, NAN], "median depth is 675 m.*set depth.scale="),
+        ([0.00065], "median depth is 0.00065 m.*set depth.scale="),
+        ([0.05, 11], r"from 0.05 to 11 m, none lies within the camera's 0.1 to 10 m; set depth.scale="),
     ],
 )
 def test_an_unlikely_depth_is_an_error_that_names_the_scale(depth, message):

@@ -56,10 +56,15 @@ def header(**changes):
         ({FORMAT: "{"}, "Expecting property name"),
         (header(version=2), "it has version 2, this pnet reads 1"),
         (header(points=0), "its number of points is 0"),
+        (header(points=10**10), "its number of points is 10000000000, expected 1 to"),
         (header(points="8"), "its number of points is '8'"),
         (header(points=...), "'points'"),
         (header(camera={"width": 3}), "missing 5 required"),
         (header(camera={**vars(CAMERA), "fx": -1}), "must be positive"),
+        (header(camera={**vars(CAMERA), "cx": float("nan")}), "NaN or infinite"),
+        (header(camera={**vars(CAMERA), "width": 10**9, "height": 10**9}), "its camera has 1000000000 x"),
+        (header(settings={"a": ["${oc.env:HOME}"]}), "its settings refer to others"),
+        ({FORMAT: "[" * 200_000}, "recursion"),
         (header(settings=[1]), "cannot convert"),
     ],
 )
@@ -70,6 +75,12 @@ def test_what_is_no_bundle_is_refused_with_its_name_and_the_reason(tmp_path, met
         read_bundle(path)
     assert str(path) in str(fault.value) and text in str(fault.value), fault.value
     assert "export it again" in str(fault.value)
+
+
+def test_weights_that_are_no_numbers_are_refused(tmp_path):
+    save_file({"weight/w": torch.tensor([1.0, torch.nan])}, tmp_path / "x.pnet", header())
+    with pytest.raises(ValueError, match="weight w is NaN or infinite"):
+        read_bundle(tmp_path / "x.pnet")
 
 
 def test_a_missing_bundle_says_how_to_make_one(tmp_path):

@@ -56,3 +56,9 @@ def test_negative_depth_is_refused():
     camera = Camera(width=2, height=1, fx=1.0, fy=1.0, cx=0.0, cy=0.0)
     with pytest.raises(ValueError, match=r"negative values \(lowest -0.5 m\)"):
         camera.depth_to_points(np.array([[0.4, -0.5]]))
+
+
+@pytest.mark.parametrize("name", ["fx", "fy", "cx", "cy", "near", "far"])
+def test_a_camera_of_nan_is_refused(name):
+    with pytest.raises(ValueError, match="camera"):
+        Camera(**{**vars(CAMERA), name: float("nan")})

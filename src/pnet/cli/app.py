@@ -220,7 +220,9 @@ def _hint(folder: Path, config_name: str, override: Override, good: list[str], f
     key, value = override.key_or_group or "", str(override.value())
     choices = sorted(path.stem for path in (folder / key).glob("*.yaml")) if key else []
     if choices and value not in choices:
-        return f"{key}={value}: no such choice{closest(value, choices)}; there are {', '.join(choices)}"
+        near, others = closest(value, choices), [path.parent.name for path in folder.glob(f"*/{value}.yaml")]
+        near = f", did you mean {others[0]}={value}?" if others else near
+        return f"{key}={value}: no such choice{near}; there are {', '.join(choices)}"
     cfg = compose(config_name, overrides=good)
     groups = [path.name for path in folder.iterdir() if path.is_dir()]
     keys = list(dict.fromkeys([*key_paths(OmegaConf.to_container(cfg)), *groups]))

@@ -36,18 +36,19 @@ def convert(cfg: DictConfig) -> None:
     if cfg.split not in ("all", *SPLITS):
         raise ValueError(f"split={cfg.split}: choose {', '.join(SPLITS)}, or all")
     root, part = Path(cfg.root), instantiate(cfg.part)
-    plan = plan_conversion(
-        open_source(cfg.data), part, root, SPLITS if cfg.split == "all" else [str(cfg.split)]
-    )
+    plan = plan_conversion(open_source(cfg.data), part, root)
+    splits = list(plan.sets) if cfg.split == "all" else [str(cfg.split)]
+    if not set(splits) <= set(plan.sets):
+        raise ValueError(f"split={cfg.split}: the data set has {', '.join(plan.sets)}")
     settings: Any = OmegaConf.to_container(cfg.part, resolve=True)
     manifest = conversion_manifest(plan, settings)
     workers = cores() if cfg.workers is None else cfg.workers
     start, scenes, empty, kept = perf_counter(), 0, 0, 0
     with (
         hold(root, f"another process makes {root}"),
-        count_progress("converting", sum(map(len, plan.sets.values())), "scenes") as advance,
+        count_progress("converting", sum(len(plan.sets[name]) for name in splits), "scenes") as advance,
     ):
-        for cycle, report in convert_all(plan, manifest, workers):
+        for cycle, report in convert_all(plan, manifest, workers, splits):
             kept += report is None
             if report is not None:
                 scenes, empty = scenes + report.scenes, empty + report.empty
@@ -58,9 +59,10 @@ def convert(cfg: DictConfig) -> None:
         f"{scenes} scenes written in {seconds:.1f} s ({scenes / seconds:.1f} scenes/s), {empty} showed no "
         f"body and were left out, {kept} cycles were there; data set in {root}"
     )
-    for split in plan.sets:
+    for split in splits:
         print_agreement(out, root, split, part)
-    out.print(f"next: pnet-train part=… data.root={root}, or pnet-data root={root}", markup=False)
+    use = "pnet-train part=…" if "train" in splits else "pnet-evaluate run=…"
+    out.print(f"next: {use} data.root={root}, or pnet-data root={root}", markup=False)
 
 
 def print_agreement(out: Any, root: Path, split: str, part: "ParametricPart") -> None:

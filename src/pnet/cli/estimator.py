@@ -6,8 +6,11 @@ from tempfile import TemporaryDirectory
 from typing import Any, Self
 
 import torch
+from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
+from pnet.cli.app import error_text
 from pnet.cli.build import network_method, part_of, read_weights
 from pnet.cli.evaluate import recovery_settings
 from pnet.cli.settings import METRICS, is_trained, read_run
@@ -19,6 +22,7 @@ from pnet.geometry.camera import Camera
 from pnet.scenes.manifest import MANIFEST
 
 NEEDED = ("seed", "part", "backbone", "model", "postprocess", "method")  # of a training's settings
+UNSUITABLE = (InstantiationException, OmegaConfBaseException, AttributeError, TypeError, KeyError)
 DEVICES = {"auto": "auto", "cpu": "cpu", "cuda": "gpu"}
 
 
@@ -56,9 +60,12 @@ class Estimator(DepthEstimator):
         path = Path(run)
         source = run_bundle(path) if path.is_dir() else read_bundle(path)
         with TemporaryDirectory() as folder:
-            cfg = settings_of(source, path, Path(folder))
-            recovery = recovery_settings(postprocess or {}, cfg)
-            method = network_method(cfg, source.weights, recovery, str(path), DEVICES[device])
+            try:
+                cfg = settings_of(source, path, Path(folder))
+                recovery = recovery_settings(postprocess or {}, cfg)
+                method = network_method(cfg, source.weights, recovery, str(path), DEVICES[device])
+            except UNSUITABLE as fault:
+                raise ValueError(f"{path}: its settings describe no network ({error_text(fault)})") from fault
         return cls(method, source.points, source.camera, background)
 
 
@@ -116,9 +123,11 @@ def settings_of(bundle: Bundle, path: Path, folder: Path) -> DictConfig:
         if Path(name).name != name or name.startswith("."):
             raise ValueError(f"{path}: holds a file named {name!r}, which is no plain name")
         (folder / name).write_bytes(content)
-    missing = [key for key in (*NEEDED, "data", "trainer") if key not in bundle.settings]
-    if missing:
-        raise ValueError(f"{path}: its settings lack {missing[0]}; export it again")
+    for key in (*NEEDED, "data", "trainer"):
+        if key not in bundle.settings:
+            raise ValueError(f"{path}: its settings lack {key}; export it again")
+        if key != "seed" and not isinstance(bundle.settings[key], dict):
+            raise ValueError(f"{path}: its setting {key} is {bundle.settings[key]!r}; export it again")
     cfg = OmegaConf.create(bundle.settings)
     if cfg.part.get("mesh") in bundle.files:
         cfg.part.mesh = str(folder / cfg.part.mesh)

@@ -6,9 +6,10 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from pnet.cli.app import closest, key_paths, run_app, short_name
+from pnet.cli.app import closest, key_of, key_paths, run_app, short_name
 from pnet.cli.settings import METRICS, is_trained, read_run
 
 if TYPE_CHECKING:
@@ -51,11 +52,18 @@ class Evaluation:
         changed = [f"{key}-{value}" for key, value in _leaves(self.postprocess)]
         every = [f"every-{self.every}"] if self.every > 1 else []
         other = [self.root.name] if self.root else []
-        return short_name("_".join([self.split, *other, *every, *changed]))
+        reader = [_source_name(self.source)] if self.source else []
+        return short_name("_".join([self.split, *other, *reader, *every, *changed]))
 
     def folder(self, run: Path) -> Path:
         """Where its files lie."""
         return run / "evaluation" / self.name
+
+
+def _source_name(source: dict[str, Any]) -> str:
+    """The reader's class and a digest of its settings, the folder among them."""
+    digest = sha256(OmegaConf.to_yaml(OmegaConf.create(source)).encode()).hexdigest()[:6]
+    return f"{str(source.get('_target_', '')).rsplit('.', 1)[-1]}-{digest}"
 
 
 def wanted_evaluations(items: Any) -> list[Evaluation]:
@@ -99,7 +107,9 @@ def evaluate(cfg: DictConfig) -> None:
             export_results(Path(cfg.results), evaluation, run, trained)
     out = Console(soft_wrap=True)
     out.print(metrics_table(metrics))
-    out.print(f"written to {evaluation.folder(run)}; next: pnet-report run={run}")
+    words = [f"run={run}", *([] if evaluation.name == "test_l" else [f"evaluation={evaluation.name}"])]
+    words += [word for word in HydraConfig.get().overrides.task if key_of(word).split(".")[0] == "data"]
+    out.print(f"written to {evaluation.folder(run)}; next: pnet-report {' '.join(words)}", markup=False)
 
 
 def other_data(cfg: DictConfig) -> tuple[Path | None, dict[str, Any] | None]:
@@ -257,3 +267,7 @@ def check_predictions(
             )
     if header.scenes != [str(scene_id) for scene_id in scenes.ids]:
         raise ValueError(f"{path}: holds other scenes than {header.split} has now; predict again")
+
+
+if __name__ == "__main__":
+    main()

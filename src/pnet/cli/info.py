@@ -24,3 +24,7 @@ def info(cfg: DictConfig) -> None:
     for name, value in {**state, "configs": config_dir(), **packages}.items():
         table.add_row(str(name), str(value))
     Console(soft_wrap=True).print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -139,3 +139,7 @@ def _parameters(part: "ParametricPart", cfg: DictConfig) -> "NDArray[np.float64]
         raise ValueError(f"values is {values}, expected numbers in mm") from fault
     part.check_named(parameters)
     return parameters
+
+
+if __name__ == "__main__":
+    main()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from pnet.cli.estimator import Estimator
     from pnet.cli.prediction_inputs import DepthCoding, Prepared, Reading
-    from pnet.cli.prediction_outputs import Writer
+    from pnet.cli.prediction_outputs import Done, Writer
     from pnet.data.background import Background
     from pnet.engine.depth_estimator import Estimate
 
@@ -69,13 +69,16 @@ def predict(cfg: DictConfig) -> None:
     from rich.console import Console
 
     from pnet.cli.prediction_inputs import build_reading, chosen_camera, find_inputs
-    from pnet.cli.prediction_outputs import Writer
+    from pnet.cli.prediction_outputs import Done, Writer, check_outputs, state_of
 
     check_values(cfg)
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
-    inputs, estimator = find_inputs(Path(cfg.input)), load(cfg)
+    others = other_files(cfg)
+    inputs = find_inputs(Path(cfg.input), cfg.kind, others)
     output, out = Path(cfg.output), Console(soft_wrap=True)
+    check_outputs(output, inputs, others)
+    estimator = load(cfg)
     file = chosen_camera(cfg)
     if file is not None and file.distorted:
         print(
@@ -85,14 +88,14 @@ def predict(cfg: DictConfig) -> None:
     reading = build_reading(cfg, file, estimator.camera)
     writer = Writer(cfg, output, len(inputs) == 1)
     estimator.background = coded_alike(estimator.background, reading.coding)
-    output.mkdir(parents=True, exist_ok=True)
     if len(inputs) == 1 and Path(cfg.input).is_file():
         estimate, seconds = predict_one(inputs[0], reading, estimator, writer)
         print_estimate(out, estimate, seconds, cfg.rows)
         out.print(f"written: {output / inputs[0].stem}.*", markup=False)
         return
     start = perf_counter()
-    tally = predict_all(cfg, inputs, reading, estimator, writer)
+    done = Done(output, state_of(cfg, reading, estimator))
+    tally = predict_all(cfg, inputs, reading, estimator, writer, done)
     print_tally(out, tally, perf_counter() - start)
     out.print(f"written to {output}", markup=False)
     if tally.failed:
@@ -106,8 +109,19 @@ def check_values(cfg: DictConfig) -> None:
     for key in ("batch", "rows"):
         if type(cfg[key]) is not int or cfg[key] < 1:
             raise ValueError(f"{key}={cfg[key]}: expected a whole number of at least 1")
+    if cfg.threads is not None and (type(cfg.threads) is not int or cfg.threads < 1):
+        raise ValueError(f"threads={cfg.threads}: expected a whole number of at least 1, or null")
+    for key in ("picture", "page", "again"):
+        if not isinstance(cfg[key], bool | None):
+            raise ValueError(f"{key}={cfg[key]}: expected true, false or null")
     if cfg.depth.scale is not None:
         require_number("depth.scale", cfg.depth.scale, 0, above=True)
+
+
+def other_files(cfg: DictConfig) -> list[Path]:
+    """The files besides the inputs that the settings name: the camera's, the empty bin's, the bundle."""
+    named = (cfg.get("camera") or {}).get("file"), cfg.background.get("image"), cfg.run
+    return [Path(str(name)) for name in named if name is not None]
 
 
 def load(cfg: DictConfig) -> "Estimator":
@@ -125,7 +139,8 @@ def coded_alike(background: "Background", coding: "DepthCoding") -> "Background"
     from pnet.data.background import EmptyBin
 
     if isinstance(background, EmptyBin) and background.scale is None:
-        return replace(background, scale=coding.scale, offset=coding.offset, radial=coding.radial)
+        shared = {key: getattr(coding, key) for key in ("scale", "offset", "radial", "of_integers")}
+        return replace(background, **shared)
     return background
 
 
@@ -139,14 +154,18 @@ def predict_one(
 
 
 def predict_all(
-    cfg: DictConfig, inputs: list[Path], reading: "Reading", estimator: "Estimator", writer: "Writer"
+    cfg: DictConfig,
+    inputs: list[Path],
+    reading: "Reading",
+    estimator: "Estimator",
+    writer: "Writer",
+    done: "Done",
 ) -> Tally:
     """Predict a folder's files; a thread reads ahead, one that cannot be read is told at the end."""
     from pnet.cli.prediction_inputs import ahead
-    from pnet.cli.prediction_outputs import Done
     from pnet.reporting.progress import count_progress
 
-    tally, done = Tally(), Done(Path(cfg.output), cfg)
+    tally = Tally()
     wanted = [path for path in inputs if cfg.again or not done.has(path)]
     tally.kept = len(inputs) - len(wanted)
     with count_progress("predicting", len(wanted), "images") as advance:

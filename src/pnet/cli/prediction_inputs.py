@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 DEPTH_ENDINGS = (".png", ".tif", ".tiff", ".exr")
 CLOUD_ENDINGS = (".ply", ".pcd", ".xyz", ".txt")
 ENDINGS = (*DEPTH_ENDINGS, *CLOUD_ENDINGS, ".npy")
+MOST_COLUMNS = 16  # of an array that is a cloud: no image is so narrow
 KINDS = ("auto", "depth", "cloud")
 
 T = TypeVar("T")
@@ -50,6 +51,7 @@ class DepthCoding:
     offset: float = 0.0
     radial: bool = False
     missing: Sequence[float] | None = None
+    of_integers: bool = False
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ class Reading:
         from pnet.data.images import npy_shape
 
         shape = npy_shape(path)
-        return len(shape) == 3 or (len(shape) == 2 and shape[1] == 3)
+        return len(shape) == 3 or (len(shape) == 2 and 3 <= shape[1] <= MOST_COLUMNS)
 
 
 def build_reading(cfg: DictConfig, file: "CameraFile | None", usual: Camera | None) -> Reading:
@@ -115,26 +117,32 @@ def build_reading(cfg: DictConfig, file: "CameraFile | None", usual: Camera | No
     """
     if cfg.kind not in KINDS:
         raise ValueError(f"kind={cfg.kind}{closest(str(cfg.kind), list(KINDS))}: choose {', '.join(KINDS)}")
-    scale, offset = cfg.depth.scale, cfg.depth.offset
+    scale, offset, told = cfg.depth.scale, cfg.depth.offset, False
     if scale is None and file is not None and file.depth_scale is not None:
-        scale = file.depth_scale / 1000  # from mm
+        scale, told = file.depth_scale / 1000, True  # from mm; a camera file speaks of 16-bit images
         offset = file.depth_offset if offset is None else offset
     missing = None if cfg.depth.missing is None else list(cfg.depth.missing)
     camera = usual if file is None else file.camera
-    return Reading(
-        cfg.kind, camera, DepthCoding(scale, offset or 0.0, bool(cfg.depth.radial), missing), cfg.cloud.unit
-    )
+    coding = DepthCoding(scale, offset or 0.0, bool(cfg.depth.radial), missing, told)
+    return Reading(cfg.kind, camera, coding, cfg.cloud.unit)
 
 
-def find_inputs(path: Path) -> list[Path]:
-    """The file, or a folder's files that may be images or clouds, by name."""
+def find_inputs(path: Path, kind: str = "auto", others: Sequence[Path] = ()) -> list[Path]:
+    """The file, or a folder's files that may be images or clouds, by name.
+
+    Args:
+        kind: "cloud" takes text files of a folder too. others: files that are no inputs, wherever they lie.
+    """
     if path.is_file():
         if path.suffix.lower() not in ENDINGS:
             raise ValueError(f"{path}: ends in {path.suffix or 'nothing'}, expected {', '.join(ENDINGS)}")
         return [path]
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: no such file or folder; give input=")
-    found = sorted(p for p in path.iterdir() if p.is_file() and p.suffix.lower() in ENDINGS)
+    wanted = set(ENDINGS) if kind == "cloud" else set(ENDINGS) - {".txt"}
+    known = {other.resolve() for other in others}
+    files = (p for p in path.iterdir() if p.is_file() and p.suffix.lower() in wanted)
+    found = sorted(p for p in files if p.resolve() not in known)
     if not found:
         raise FileNotFoundError(f"{path}: holds no depth image or cloud ({', '.join(ENDINGS)})")
     names: dict[str, Path] = {}

@@ -1,5 +1,6 @@
 """What pnet-predict leaves: files for every image, and a note of which are done."""
 
+from collections.abc import Sequence
 from hashlib import sha256
 from pathlib import Path
 from time import perf_counter
@@ -9,7 +10,8 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 if TYPE_CHECKING:
-    from pnet.cli.prediction_inputs import Prepared
+    from pnet.cli.estimator import Estimator
+    from pnet.cli.prediction_inputs import Prepared, Reading
     from pnet.engine.depth_estimator import Estimate
     from pnet.records import Scene
 
@@ -20,14 +22,14 @@ class Done:
     """Which images have results of these settings already.
 
     Args:
-        folder: of the results. cfg: the settings of pnet-predict.
+        folder: of the results. state: see `state_of`.
     """
 
-    def __init__(self, folder: Path, cfg: DictConfig) -> None:
+    def __init__(self, folder: Path, state: str) -> None:
         from pnet.engine.provenance import read_json
 
         self._path, self._folder = folder / DONE, folder
-        self._settings = self._digest(cfg)
+        self._settings = state
         self._images: dict[str, Any] = {}
         if self._path.is_file():
             try:
@@ -54,17 +56,34 @@ class Done:
         status = path.stat()
         return [status.st_size, status.st_mtime_ns]
 
-    @staticmethod
-    def _digest(cfg: DictConfig) -> str:
-        """Of the weights and of all settings that results depend on."""
-        from pnet.engine.checkpoints import NAME
 
-        run = Path(cfg.run)
-        weights = run / "checkpoints" / NAME if run.is_dir() else run
-        kept: Any = OmegaConf.to_container(cfg, resolve=True)
-        for key in ("run", "input", "output", "again", "rows", "threads", "batch"):
-            kept.pop(key)
-        return sha256(weights.read_bytes() + OmegaConf.to_yaml(kept).encode()).hexdigest()[:16]
+def state_of(cfg: DictConfig, reading: "Reading", estimator: "Estimator") -> str:
+    """Digest of all that results depend on besides the images: weights, settings, camera, background."""
+    from pnet.cli.settings import RESOLVED
+    from pnet.engine.checkpoints import NAME
+
+    run = Path(cfg.run)
+    files = [run / "checkpoints" / NAME, run / RESOLVED] if run.is_dir() else [run]
+    image = cfg.background.get("image")
+    files += [] if image is None else [Path(image)]
+    kept: Any = OmegaConf.to_container(cfg, resolve=True)
+    for key in ("run", "input", "output", "again", "rows", "threads", "batch", "camera"):
+        kept.pop(key, None)
+    told = (OmegaConf.to_yaml(kept), repr(reading), repr(estimator.background), repr(estimator.points))
+    contents = [file.read_bytes() for file in files if file.is_file()]
+    return sha256(b"\0".join([*contents, *map(str.encode, told)])).hexdigest()[:16]
+
+
+def check_outputs(output: Path, inputs: Sequence[Path], others: Sequence[Path]) -> None:
+    """Refuse to write results over what they are made from."""
+    kept = {path.resolve() for path in (*inputs, *others)}
+    for path in inputs:
+        for ending in (".json", ".csv", ".png", ".html"):
+            result = (output / f"{path.stem}{ending}").resolve()
+            if result in kept:
+                raise ValueError(
+                    f"output={output}: {result.name} would be written over; choose another folder"
+                )
 
 
 class Writer:
@@ -86,6 +105,7 @@ class Writer:
         from pnet.reporting.prediction_tables import write_detections_csv
 
         start, name, part = perf_counter(), prepared.path.stem, estimate.part
+        self._output.mkdir(parents=True, exist_ok=True)
         picture = self._output / f"{name}.png"
         write_detections_csv(picture.with_suffix(".csv"), estimate.detections, part)
         if self._picture or self._page:

@@ -109,3 +109,7 @@ def page_content(
         settings=OmegaConf.to_yaml(trained),
         provenance=rows,
     )
+
+
+if __name__ == "__main__":
+    main()

@@ -23,3 +23,7 @@ def score(cfg: DictConfig) -> None:
     if cfg.output is not None:
         write_json(Path(cfg.output), values)
     print(json.dumps(values))
+
+
+if __name__ == "__main__":
+    main()

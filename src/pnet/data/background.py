@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pnet.data.depth_files import read_depth
+from pnet.data.depth_files import check_depth, read_depth
 from pnet.geometry.camera import Camera
 from pnet.scenes.limits import require_number, require_range
 
@@ -209,7 +209,7 @@ class EmptyBin:
         image: file of the depth image, any that `read_depth` reads; read once.
         distance: so much nearer than the empty bin, metres.
         scale: metres per unit of the file; None: see `read_depth`.
-        offset, radial: see `read_depth`.
+        offset, radial, of_integers: see `read_depth`.
         reach: pixels, to each side.
     """
 
@@ -219,6 +219,7 @@ class EmptyBin:
     offset: float = 0.0
     radial: bool = False
     reach: int = 1
+    of_integers: bool = False
     _read: dict[Camera, NDArray[np.float64]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -245,8 +246,17 @@ class EmptyBin:
         """(height · width) least depth of the empty bin around each pixel; infinite where none is known."""
         from scipy.ndimage import minimum_filter
 
-        depth = read_depth(Path(self.image), camera, self.scale, radial=self.radial, offset=self.offset)
-        if not np.isfinite(depth).any():
-            raise ValueError(f"background.image: {self.image}: no pixel was measured")
+        depth = read_depth(
+            Path(self.image),
+            camera,
+            self.scale,
+            radial=self.radial,
+            offset=self.offset,
+            of_integers=self.of_integers,
+        )
+        try:
+            check_depth(depth, Path(self.image), camera)
+        except ValueError as fault:
+            raise ValueError(f"background.image: {fault} (of the empty bin: background.scale)") from None
         known = np.where(np.isfinite(depth), depth, np.inf)
         return np.asarray(minimum_filter(known, 2 * int(self.reach) + 1, mode="nearest")).reshape(-1)

@@ -81,7 +81,7 @@ def check_cloud(points: NDArray[np.floating], path: Path) -> None:
     if not NEAREST <= median <= FARTHEST:
         raise ValueError(
             f"{path}: the median depth is {median:g} m, expected {NEAREST:g} to {FARTHEST:g} m; "
-            f"set unit= to the file's ({', '.join(UNITS)})"
+            f"set cloud.unit= to the file's ({', '.join(UNITS)})"
         )
 
 

@@ -93,18 +93,14 @@ class Conversion:
         )
 
 
-def plan_conversion(
-    source: DataSource, part: ParametricPart, root: Path, splits: Sequence[str] = SPLITS
-) -> Conversion:
+def plan_conversion(source: DataSource, part: ParametricPart, root: Path) -> Conversion:
     """List what there is to convert.
 
-    Args:
-        splits: those wanted; one that the source lacks is left out where others are there.
     Raises:
-        ValueError, FileNotFoundError: where the source has none of them.
+        ValueError, FileNotFoundError: where the source has no split at all; one that it lacks is left out.
     """
     sets, faults = {}, []
-    for split in splits:
+    for split in SPLITS:
         try:
             sets[split] = source.scenes(split, part)
         except (ValueError, FileNotFoundError) as fault:
@@ -137,18 +133,18 @@ def first_points(plan: Conversion) -> int:
 
 
 def convert(
-    plan: Conversion, manifest: Mapping[str, Any], workers: int
+    plan: Conversion, manifest: Mapping[str, Any], workers: int, splits: Sequence[str] = SPLITS
 ) -> Iterator[tuple[ConvertedCycle, CycleReport | None]]:
     """Write what is missing.
 
     Args:
-        manifest: of `conversion_manifest`. workers: processes; 0 works in this one.
+        manifest: of `conversion_manifest`. workers: processes; 0 works in this one. splits: those wanted now.
     Yields:
         Every file and its report, or None where it was there.
     """
     open_root(plan.root, manifest)
     missing = []
-    for cycle in plan.cycles:
+    for cycle in (one for one in plan.cycles if one.split in splits):
         if plan.is_done(cycle):
             yield cycle, None
         else:

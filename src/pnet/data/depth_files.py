@@ -26,6 +26,7 @@ def read_depth(
     missing: Sequence[float] | None = None,
     radial: bool = False,
     offset: float = 0.0,
+    of_integers: bool = False,
 ) -> Depth:
     """A depth image of any format that `read_image` knows, and OpenEXR files with several channels.
 
@@ -39,7 +40,9 @@ def read_depth(
         missing: values of the file that mean "not measured", besides 0, NaN, infinity and whatever is 1e9 or
             more. None: 65535 in files of unsigned 16 bits. An empty list: none.
         radial: the file holds the distance from the camera's centre, not planar depth; needs the camera.
-        offset: metres added to the file's number times `scale`, as files between two clip planes have it.
+        offset: metres added to the file's number times `scale`, as files between two clip planes have it; a 0
+            in the file is a depth then.
+        of_integers: `scale`, `offset` and `missing` are those of integers; floating point numbers are metres.
     Returns:
         (height, width) planar depth, metres, more than 0; NaN where nothing was measured.
     Raises:
@@ -52,6 +55,8 @@ def read_depth(
     if radial and camera is None:
         raise ValueError(f"{path}: turning distances into planar depth needs the camera")
     raw = _read_raw(path, None if camera is None else (camera.height, camera.width))
+    if of_integers and raw.dtype.kind == "f":
+        scale, offset, missing = None, 0.0, None
     depth = _in_metres(raw, _scale_of(raw, scale, path), missing, path, offset)
     return depth / _ray_lengths(camera) if radial and camera is not None else depth
 
@@ -70,13 +75,13 @@ def check_depth(depth: Depth, path: Path, camera: Camera | None = None) -> None:
     if not NEAREST <= median <= FARTHEST:
         raise ValueError(
             f"{path}: the median depth is {median:g} m, expected {NEAREST:g} to {FARTHEST:g} m; "
-            f"set scale= to the metres per unit of the file"
+            f"set depth.scale= to the metres per unit"
         )
     if camera is not None and not ((known >= camera.near) & (known <= camera.far)).any():
         raise ValueError(
             f"{path}: depths reach from {known.min():g} to {known.max():g} m, none lies within the camera's "
-            f"{camera.near:g} to {camera.far:g} m; set scale= to the metres per unit of the file, or "
-            f"camera.near and camera.far"
+            f"{camera.near:g} to {camera.far:g} m; set depth.scale= to the metres per unit, or "
+            f"near and far of the camera"
         )
 
 
@@ -114,7 +119,7 @@ def _scale_of(raw: NDArray[Any], scale: float | None, path: Path) -> float:
         return float(scale)
     if raw.dtype.kind in "iu" and raw.dtype.itemsize == 1:
         raise ValueError(
-            f"{path}: holds integers of 8 bits, which seldom are depths; set scale= to the metres per unit"
+            f"{path}: holds integers of 8 bits, which seldom are depths; set depth.scale= to metres per unit"
         )
     return 1.0 if raw.dtype.kind == "f" else MILLIMETRE
 
@@ -128,12 +133,13 @@ def _in_metres(
         raise ValueError(f"missing is {list(missing)!r}, expected a list of numbers")
     with np.errstate(invalid="ignore"):  # some NaN complain
         values = raw.astype(np.float64)
-    lost = ~np.isfinite(values) | (values == 0) | (values >= NOTHING) | np.isin(values, list(missing))
+    nothing = (values == 0) & (offset == 0)
+    lost = ~np.isfinite(values) | nothing | (values >= NOTHING) | np.isin(values, list(missing))
     values[lost] = np.nan
     if (values < 0).any():
         raise ValueError(
             f"{path}: has negative depths (lowest {np.nanmin(values):g}); "
-            f"name the value in missing= if it means that nothing was measured"
+            f"name the value in missing (depth.missing=) if it means that nothing was measured"
         )
     depth = values * scale + offset
     depth[~(np.isfinite(depth) & (depth > 0))] = np.nan  # what the scale brought out of the numbers' range

@@ -14,6 +14,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from pnet.data.images import MOST_PIXELS
+from pnet.data.public.checks import MOST_POINTS
 from pnet.geometry.camera import Camera
 from pnet.scenes.record_file import write_atomically
 
@@ -71,8 +73,15 @@ def read_bundle(path: Path) -> Bundle:
         if header["version"] != VERSION:
             raise ValueError(f"it has version {header['version']}, this pnet reads {VERSION}")
         camera, points = header["camera"], header["points"]
-        if type(points) is not int or points < 1:
-            raise ValueError(f"its number of points is {points!r}")
+        if type(points) is not int or not 1 <= points <= MOST_POINTS:
+            raise ValueError(f"its number of points is {points!r}, expected 1 to {MOST_POINTS:,}")
+        if camera is not None and int(camera.get("width", 1)) * int(camera.get("height", 1)) > MOST_PIXELS:
+            raise ValueError(f"its camera has {camera['width']} x {camera['height']} pixels")
+        if "${" in json.dumps(header["settings"]):  # they were resolved when it was written
+            raise ValueError("its settings refer to others")
+        for name, weight in _named(tensors, _WEIGHT).items():
+            if not bool(torch.isfinite(weight).all()):
+                raise ValueError(f"weight {name} is NaN or infinite")
         return Bundle(
             settings=dict(header["settings"]),
             weights=_named(tensors, _WEIGHT),
@@ -81,7 +90,7 @@ def read_bundle(path: Path) -> Bundle:
             files={name: value.numpy().tobytes() for name, value in _named(tensors, _FILE).items()},
             about=dict(header["about"]),
         )
-    except (SafetensorError, LookupError, TypeError, ValueError, OSError) as fault:
+    except (SafetensorError, LookupError, TypeError, ValueError, OSError, RecursionError) as fault:
         raise ValueError(
             f"{path}: not a bundle that this pnet reads ({' '.join(str(fault).split())}); export it again"
         ) from fault

@@ -28,6 +28,8 @@ class Camera:
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
             raise ValueError(f"camera image is {self.width} x {self.height}, expected at least 1 x 1")
+        if not np.isfinite([self.fx, self.fy, self.cx, self.cy]).all():
+            raise ValueError(f"camera has values that are NaN or infinite: {self}")
         if self.fx <= 0 or self.fy <= 0:
             raise ValueError(f"camera focal lengths fx={self.fx}, fy={self.fy} must be positive")
         if not 0 < self.near < self.far:

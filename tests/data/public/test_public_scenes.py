@@ -57,10 +57,11 @@ def test_the_digest_knows_which_scenes_there_are_and_not_where():
 
 def test_the_manifest_counts_the_scenes_of_every_split():
     some = listed({0: 2}) + listed({1: 3}, split="test_l")
-    made = public_manifest("bins", {"points": 5}, ROOT, some)
+    made = public_manifest("bins", {"points": 5}, ROOT, some, None)
     assert made == {
         "source": "bins",
         "points": 5,
+        "camera": None,
         "scenes": {"test_l": 3, "val": 2},
         "listing": listing_digest(ROOT, some),
     }

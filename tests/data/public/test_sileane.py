@@ -225,6 +225,7 @@ def test_a_part_of_several_sizes_is_refused(write_small, tn34):
 def test_the_manifest_tells_settings_and_scenes_apart(write_small, tmp_path):
     root = write_small()
     made = SileaneData(str(root), points=64).manifest()
+    assert made["camera"] == SMALL.to_dict()
     assert made["source"] == "sileane" and made["scenes"] == {"test_l": 4}
     assert json.loads(json.dumps(made)) == made
     shutil.copytree(root, tmp_path / "elsewhere")

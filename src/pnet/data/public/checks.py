@@ -14,6 +14,7 @@ from pnet.parts.base import ParametricPart
 from pnet.records import Scene
 
 MOST_POINTS = 1_000_000
+PARAMETERS = "parameters.json"  # sizes of the bodies by name, metres, as pnet exports them
 STEEPEST = float(np.tan(np.deg2rad(85)))  # beyond it, an angle of view is a mistake
 
 
@@ -32,15 +33,14 @@ class FixedPart:
 
 
 def fixed_part(part: ParametricPart, data_set: Path) -> FixedPart:
-    """The part object that all bodies of a data set are: that of its `parameters.json`, which pnet's exports
-    have, or the single one of the template.
+    """The part object that all bodies of a data set are, by its `PARAMETERS` or as the template has one only.
 
     Args:
         part: the template. data_set: its folder.
     Raises:
         ValueError: where the template has several and no file says which; names the folder or the file.
     """
-    objects, file = len(part.grids["L"]), data_set / "parameters.json"
+    objects, file = len(part.grids["L"]), data_set / PARAMETERS
     if file.is_file():
         parameters = _read_parameters(file, part)
     elif objects == 1:

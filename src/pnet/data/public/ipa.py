@@ -86,7 +86,9 @@ class IpaData:
         del settings["root"]
         settings["frame"] = {key: np.asarray(x, float).tolist() for key, x in settings["frame"].items()}
         listed = [one for split, cycles in self._split().items() for one in _scenes(cycles, split)]
-        return public_manifest("ipa", settings, Path(self.root).resolve(), listed)
+        parts = [cycle.part for cycles in self._split().values() for cycle in cycles]
+        camera = read_camera(parameter_file(parts[0])) if parts else None
+        return public_manifest("ipa", settings, Path(self.root).resolve(), listed, camera)
 
     def scenes(self, split: str, part: ParametricPart, every: int = 1, keep: Keep | None = None) -> SceneSet:
         """See `DataSource`; `part` has one part object, as all bodies have the same size."""

@@ -75,9 +75,10 @@ class ParametricData:
             "points": self.points,
             "val_cycles": self.val_cycles,
             "frame": {"R": np.array(self.frame.R).tolist(), "t": np.array(self.frame.t).tolist()},
-            "camera": None if self.camera is None else self.camera.to_dict(),
         }
-        return public_manifest("parametric", settings, root, listed)
+        found = find_camera(root, listed[0].folder) if self.camera is None else None
+        camera = self.camera if found is None else found.camera
+        return public_manifest("parametric", settings, root, listed, camera)
 
     def scenes(
         self, split: str, part: ParametricPart, every: int = 1, keep: Keep | None = None

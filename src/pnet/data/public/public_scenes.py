@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pnet.data.source import Keep, SceneSet
+from pnet.geometry.camera import Camera
 from pnet.records import Scene, SceneId
 
 
@@ -81,14 +82,16 @@ def listing_digest(root: Path, listed: Sequence[Listed]) -> str:
 
 
 def public_manifest(
-    name: str, settings: dict[str, Any], root: Path, listed: Sequence[Listed]
+    name: str, settings: dict[str, Any], root: Path, listed: Sequence[Listed], camera: Camera | None
 ) -> dict[str, Any]:
     """What stands for a public data set: its settings, and which scenes there are.
 
     Args:
         name: of the data set. settings: of the reader, without the folder. root: the folder.
-        listed: all its scenes.
+        listed: all its scenes. camera: of the first of them, where it is known.
     """
     splits = sorted({one.id.split for one in listed})
     scenes = {split: sum(one.id.split == split for one in listed) for split in splits}
-    return {"source": name, **settings, "scenes": scenes, "listing": listing_digest(root, listed)}
+    seen = None if camera is None else camera.to_dict()
+    listing = listing_digest(root, listed)
+    return {"source": name, **settings, "camera": seen, "scenes": scenes, "listing": listing}

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from pnet.data.public.checks import FixedPart, check_points, check_poses_fit, fixed_part
+from pnet.data.json_files import read_json
+from pnet.data.public.checks import PARAMETERS, FixedPart, check_points, check_poses_fit, fixed_part
 from pnet.data.public.coded_depth import read_coded_depth, read_codes
 from pnet.data.public.labelled_image import LabelledImage, instance_indices, scene_of_image
 from pnet.data.public.listing import check_counterparts, check_distinct, files_by_stem
@@ -26,6 +27,7 @@ from pnet.records import Scene, SceneId
 
 SPLITS = ("train", "val", "test_l")
 DEPTHS = ("depth", "depth_gt")
+CAMERA = "camera_params.txt"
 MISSING = (65535,)  # code of a pixel without depth
 _NAME = r".+_([0-9]{1,6})_([0-9]{1,6})"
 _IMAGE = re.compile(rf"({_NAME})\.(?:png|PNG)")
@@ -81,12 +83,16 @@ class SileaneData:
             "splits": {split: None if c is None else list(c) for split, c in self.splits.items()},
             "frame": {name: np.asarray(value, float).tolist() for name, value in asdict(self.frame).items()},
         }
-        return public_manifest("sileane", settings, Path(self.root), listed)
+        root = Path(self.root)
+        sizes = root / PARAMETERS
+        if sizes.is_file():
+            settings["parameters"] = read_json(sizes)
+        return public_manifest("sileane", settings, root, listed, read_camera(root / CAMERA).camera)
 
     def scenes(self, split: str, part: ParametricPart, every: int = 1, keep: Keep | None = None) -> SceneSet:
         """See `DataSource`; `part` has one part object, as all bodies have the same size."""
         shown, listed = fixed_part(part, Path(self.root)), self._listed(split)
-        camera = read_camera(Path(self.root) / "camera_params.txt")
+        camera = read_camera(Path(self.root) / CAMERA)
         nothing = self._background({one.id.cycle for one in listed}, camera)
         return PublicScenes(listed, _Reader(self, camera, shown, nothing), self.points, every, keep)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from pnet.data.public.sileane import SileaneData
+from pnet.data.public.sileane import CAMERA, SileaneData
 from pnet.data.public.sileane_camera import read_camera
 from pnet.records import Detections
 
@@ -16,7 +16,7 @@ def world_detections(data: SileaneData, found: Detections) -> Detections:
     Args:
         data: the data set. found: in one of its scenes, part → camera.
     """
-    camera = read_camera(Path(data.root) / "camera_params.txt")
+    camera = read_camera(Path(data.root) / CAMERA)
     R, t = data.frame.object_poses(found.R.cpu().double().numpy(), found.t.cpu().double().numpy())
     R, t = camera.R @ R, t @ camera.R.T + camera.t
     return replace(found, R=torch.from_numpy(R), t=torch.from_numpy(t))
