@@ -62,11 +62,14 @@ def test_a_bop_export_numbers_scenes_and_objects(smoke, run_here, tmp_path):
         "data",
         "export",
         f"root={smoke.data}",
-        "split=test_l",
         "layout=bop",
         f"output={tmp_path}",
     )
     assert outcome.code == 0, outcome
+    assert sorted(path.name for path in tmp_path.iterdir() if path.is_dir()) == [
+        "models", "test_g", "test_l", "train", "val",
+    ]  # fmt: skip
+    assert (tmp_path / "test_g" / "test_g" / "000000" / "scene_gt.json").is_file()
     truth = json.loads((tmp_path / "test_l" / "000002" / "scene_gt.json").read_text())
     assert [len(truth[str(i)]) for i in (1, 2, 3)] == [1, 2, 3] and truth["1"][0]["obj_id"] == 1
     assert (tmp_path / "models" / "obj_000001.ply").is_file()

@@ -152,7 +152,7 @@ def test_icp_alone_trains_pprnet_under_its_plain_name():
     again = resolved(*job.command())
     assert again.model._target_.endswith("PPRNet")
     (evaluation,) = wanted_evaluations(OmegaConf.to_container(again.evaluate))
-    assert OmegaConf.to_container(recovery_settings(evaluation, again))["refine"] == ICP
+    assert OmegaConf.to_container(recovery_settings(evaluation.postprocess, again))["refine"] == ICP
 
 
 # how many
@@ -600,14 +600,14 @@ def test_evaluating_for_a_cell_has_the_cells_post_processing(trained, wanted):
     target = OmegaConf.to_container(want.postprocess)
     evaluation = cell_evaluation(OmegaConf.to_container(have.postprocess), CELL, target)
     assert evaluation.split == "test_g"
-    assert OmegaConf.to_container(recovery_settings(evaluation, have)) == target
+    assert OmegaConf.to_container(recovery_settings(evaluation.postprocess, have)) == target
 
 
 def test_another_class_of_post_processing_keeps_all_settings():
     have = resolved("part=tn34", "protocol=smoke")
     target = {**OmegaConf.to_container(have.postprocess), "_target_": "mine.Recovery"}
     evaluation = cell_evaluation(OmegaConf.to_container(have.postprocess), CELL, target)
-    assert OmegaConf.to_container(recovery_settings(evaluation, have)) == target
+    assert OmegaConf.to_container(recovery_settings(evaluation.postprocess, have)) == target
 
 
 # names

@@ -107,8 +107,9 @@ def export(cfg: DictConfig, opened: Opened) -> None:
     for split in data.splits if cfg.split == "all" else [cfg.split]:
         scenes = StoredData(data.root).scenes(split, data.part)
         with count_progress(f"exporting {split}", len(scenes), "scenes") as advance:
-            # Siléane's names do not tell the split, so each has a folder
-            folder = output / split if cfg.layout == "sileane" else output
+            # Siléane's names do not tell the split, and BOP has one set of objects and one test split
+            shared = cfg.layout == "bop" and split != "test_g"
+            folder = output if shared else output / split
             written = write(scenes, data.part, folder, imaging, advance)
         folders = [written] if isinstance(written, Path) else written
         out.print(f"{len(scenes)} scenes: {', '.join(map(str, folders))}", markup=False)

@@ -18,7 +18,7 @@ from pnet.geometry.camera import Camera
 
 if TYPE_CHECKING:
     from pnet.data.camera_files import CameraFile
-    from pnet.engine.depth_estimator import Cloud, DepthEstimator
+    from pnet.engine.depth_estimator import DepthEstimator, SampledCloud
 
 DEPTH_ENDINGS = (".png", ".tif", ".tiff", ".exr")
 CLOUD_ENDINGS = (".ply", ".pcd", ".xyz", ".txt")
@@ -39,7 +39,7 @@ class Prepared:
     """
 
     path: Path
-    cloud: "Cloud"
+    cloud: "SampledCloud"
     depth: NDArray[np.float64] | None
 
 

@@ -19,7 +19,7 @@ Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class SampledCloud:
     """What an image gives the method.
 
     Attributes:
@@ -45,7 +45,7 @@ class Estimate:
     """
 
     detections: Detections
-    cloud: Cloud
+    cloud: SampledCloud
     part: ParametricPart
     seconds: dict[str, float]
 
@@ -108,7 +108,7 @@ class DepthEstimator:
         """The instances in a cloud (n, 3), camera frame (x right, y down, z forward), metres."""
         return self.recover([self.prepare_cloud(points)])[0]
 
-    def prepare(self, depth: NDArray[np.floating], camera: Camera | None = None) -> Cloud:
+    def prepare(self, depth: NDArray[np.floating], camera: Camera | None = None) -> SampledCloud:
         """The sampled points on parts of a depth image, see `estimate`."""
         camera = camera or self.camera
         if camera is None:
@@ -120,7 +120,7 @@ class DepthEstimator:
             pixels = np.flatnonzero((cloud[:, 2] >= camera.near) & (cloud[:, 2] <= camera.far))
         return self._sampled(cloud[pixels], pixels, camera, start)
 
-    def prepare_cloud(self, points: NDArray[np.floating]) -> Cloud:
+    def prepare_cloud(self, points: NDArray[np.floating]) -> SampledCloud:
         """The sampled points on parts of a cloud, see `estimate_cloud`."""
         start = perf_counter()
         if points.ndim != 2 or points.shape[1] != 3:
@@ -130,14 +130,14 @@ class DepthEstimator:
 
     def _sampled(
         self, cloud: Points, pixels: NDArray[np.int64] | None, camera: Camera | None, start: float
-    ) -> Cloud:
+    ) -> SampledCloud:
         left = cloud[self.background(cloud, pixels, camera)]
         middle = perf_counter()
         order = farthest_point_order(left, self.points) if len(left) else np.zeros(0, np.int64)
         seconds = {"background": middle - start, "sampling": perf_counter() - middle}
-        return Cloud(left[order].astype(np.float32), len(cloud), len(left), camera, seconds)
+        return SampledCloud(left[order].astype(np.float32), len(cloud), len(left), camera, seconds)
 
-    def recover(self, clouds: Sequence[Cloud]) -> list[Estimate]:
+    def recover(self, clouds: Sequence[SampledCloud]) -> list[Estimate]:
         """The instances in prepared clouds; those with points go through the network as one batch."""
         filled = [cloud for cloud in clouds if len(cloud.points)]
         timing = self.method.timing
@@ -152,7 +152,7 @@ class DepthEstimator:
             estimates.append(Estimate(own, cloud, self.part, {**cloud.seconds, **more}))
         return estimates
 
-    def _found(self, clouds: Sequence[Cloud]) -> list[Detections]:
+    def _found(self, clouds: Sequence[SampledCloud]) -> list[Detections]:
         if not clouds:
             return []
         return self.method.estimate(torch.from_numpy(np.stack([cloud.points for cloud in clouds])))
