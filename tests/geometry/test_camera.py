@@ -31,6 +31,11 @@ def test_a_depth_image_back_projects_to_its_own_pixels():
     np.testing.assert_allclose(CAMERA.project(points), np.stack([u, v], -1), atol=1e-10)
 
 
+def test_ray_lengths_are_those_of_the_rays():
+    v, u = np.mgrid[:48, :64]
+    np.testing.assert_allclose(CAMERA.ray_lengths(), np.linalg.norm(CAMERA.rays(u, v), axis=-1), rtol=1e-14)
+
+
 def test_missing_depth_stays_missing():
     depth = np.full((48, 64), np.nan)
     assert np.isnan(CAMERA.depth_to_points(depth)).all()

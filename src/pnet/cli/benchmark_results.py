@@ -46,20 +46,19 @@ def write_results(
     """
     from pnet.data.export.bop import bop_object_id, bop_scene_id
     from pnet.data.export.results import BopImage, write_bop_results, write_sileane_results
-    from pnet.data.export.sileane import sileane_name
+    from pnet.data.export.sileane import sileane_folder, sileane_name
     from pnet.data.public.public_scenes import PublicScenes
     from pnet.data.public.sileane import SileaneData
     from pnet.data.public.sileane_results import world_detections
 
     if isinstance(source, SileaneData) and isinstance(scenes, PublicScenes):
-        names, placed = scenes.names, [world_detections(source, one) for one in found]
-        write_sileane_results(folder, names, placed, part.parameter_names)
+        write_sileane_results(folder, scenes.names, world_detections(source, found), part.parameter_names)
     else:
-        for index in sorted({one.part_index for one in scenes.ids}):
-            own = [i for i, one in enumerate(scenes.ids) if one.part_index == index]
-            names = [sileane_name(part.name, scenes.ids[i]) for i in own]
-            where = folder / f"{part.name}_{index}"
-            write_sileane_results(where, names, [found[i] for i in own], part.parameter_names)
+        ids = scenes.ids
+        for name in sorted({sileane_folder(part.name, one) for one in ids}):
+            own = [i for i, one in enumerate(ids) if sileane_folder(part.name, one) == name]
+            names = [sileane_name(part.name, ids[i]) for i in own]
+            write_sileane_results(folder / name, names, [found[i] for i in own], part.parameter_names)
     images = [
         BopImage(bop_scene_id(one), one.drop, bop_object_id(one), detections, seconds)
         for one, detections in zip(scenes.ids, found, strict=True)

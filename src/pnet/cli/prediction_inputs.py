@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 DEPTH_ENDINGS = (".png", ".tif", ".tiff", ".exr")
 CLOUD_ENDINGS = (".ply", ".pcd", ".xyz", ".txt")
 ENDINGS = (*DEPTH_ENDINGS, *CLOUD_ENDINGS, ".npy")
-MOST_COLUMNS = 16  # of an array that is a cloud: no image is so narrow
 KINDS = ("auto", "depth", "cloud")
 
 T = TypeVar("T")
@@ -103,6 +102,7 @@ class Reading:
             return self.kind == "cloud"
         if path.suffix.lower() != ".npy":
             return path.suffix.lower() in CLOUD_ENDINGS
+        from pnet.data.cloud_files import MOST_COLUMNS
         from pnet.data.images import npy_shape
 
         shape = npy_shape(path)

@@ -17,7 +17,7 @@ from pnet.data.point_records import read_rows
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # metres
 MOST_BYTES = 4 << 30
-_MOST_COLUMNS = 16  # of an array; more: its axes are the wrong way round
+MOST_COLUMNS = 16  # of an array; more: its axes are the wrong way round
 
 Points = NDArray[np.float64]
 
@@ -101,12 +101,12 @@ def _read_npy(path: Path) -> Points:
             f"{path}: not readable as an array ({' '.join(str(fault).split())[:200]})"
         ) from fault
     shape: tuple[int, ...] = getattr(array, "shape", ())
-    rows = len(shape) == 2 and 3 <= shape[1] <= _MOST_COLUMNS
+    rows = len(shape) == 2 and 3 <= shape[1] <= MOST_COLUMNS
     image = len(shape) == 3 and shape[2] == 3
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf" or not (rows or image):
         what = f"{shape or '?'} of type {getattr(array, 'dtype', '?')}"
         raise ValueError(
-            f"{path}: holds {what}, expected numbers (n, 3 to {_MOST_COLUMNS}) or (height, width, 3)"
+            f"{path}: holds {what}, expected numbers (n, 3 to {MOST_COLUMNS}) or (height, width, 3)"
         )
     return np.array(array[..., :3], np.float64).reshape(-1, 3)
 

@@ -114,22 +114,17 @@ def plan_conversion(source: DataSource, part: ParametricPart, root: Path) -> Con
 
 def conversion_manifest(plan: Conversion, part: Mapping[str, Any]) -> dict[str, Any]:
     """The manifest of the store that comes out. part: its settings."""
-    first = next(scenes[0] for scenes in plan.sets.values())
+    scenes = next(iter(plan.sets.values()))
     files = {split: sum(cycle.split == split for cycle in plan.cycles) for split in plan.sets}
     return {
         "converted": plan.source.manifest(),
         "fingerprint": plan.fingerprint,
         "part": dict(part),
-        "camera": asdict(first.camera),
-        "points": first_points(plan),
+        "camera": asdict(scenes[0].camera),
+        "points": scenes.points_per_scene,
         "cycles": [[cycle.split, *cycle.place] for cycle in plan.cycles],
         "files": files,
     }
-
-
-def first_points(plan: Conversion) -> int:
-    """N of the scenes."""
-    return next(iter(plan.sets.values())).points_per_scene
 
 
 def convert(

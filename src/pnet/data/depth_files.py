@@ -58,7 +58,7 @@ def read_depth(
     if of_integers and raw.dtype.kind == "f":
         scale, offset, missing = None, 0.0, None
     depth = _in_metres(raw, _scale_of(raw, scale, path), missing, path, offset)
-    return depth / _ray_lengths(camera) if radial and camera is not None else depth
+    return depth / camera.ray_lengths() if radial and camera is not None else depth
 
 
 def check_depth(depth: Depth, path: Path, camera: Camera | None = None) -> None:
@@ -144,9 +144,3 @@ def _in_metres(
     depth = values * scale + offset
     depth[~(np.isfinite(depth) & (depth > 0))] = np.nan  # what the scale brought out of the numbers' range
     return depth
-
-
-def _ray_lengths(camera: Camera) -> Depth:
-    """(height, width) length of each pixel's ray with z = 1."""
-    v, u = np.mgrid[: camera.height, : camera.width]
-    return np.asarray(np.linalg.norm(camera.rays(u, v), axis=-1))

@@ -18,6 +18,14 @@ def read_json(path: Path) -> Any:
         raise ValueError(f"{path}: is not valid JSON: {error}") from error
 
 
+def read_object(path: Path) -> dict[str, Any]:
+    """Parse a file that holds an object; ValueError names it."""
+    fields = read_json(path)
+    if not isinstance(fields, dict):
+        raise ValueError(f"{path}: holds a {type(fields).__name__}, expected an object")
+    return fields
+
+
 def read_numbers(
     fields: dict[str, Any], key: str, where: str, *shapes: tuple[int, ...]
 ) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ import roma
 import torch
 from torch import Tensor
 
-from pnet.data.json_files import check_rotations, read_json, read_numbers, read_rotation
+from pnet.data.json_files import check_rotations, read_numbers, read_object, read_rotation
 from pnet.geometry.pose_space import PoseSpace
 from pnet.geometry.symmetry import (
     FiniteSymmetry,
@@ -32,9 +32,7 @@ def read_poseutils(path: Path) -> PoseSpace:
     Note:
         A missing Rref2i is the identity, a missing tref2i zero.
     """
-    fields = read_json(path)
-    if not isinstance(fields, dict):
-        raise ValueError(f"{path}: holds a {type(fields).__name__}, expected an object")
+    fields = read_object(path)
     where = str(path)
     symmetry, scale = _symmetry_and_scale(fields, where)
     fields = {"Rref2i": np.eye(3).tolist(), "tref2i": [0.0] * 3} | fields

@@ -61,6 +61,13 @@ class Camera:
         u, v = np.asarray(u, np.float64), np.asarray(v, np.float64)
         return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones_like(u)], -1)
 
+    def ray_lengths(self) -> NDArray[np.float64]:
+        """(height, width) lengths of the pixels' rays with z = 1: distance over planar depth."""
+        x = (np.arange(self.width) - self.cx) / self.fx
+        y = (np.arange(self.height) - self.cy) / self.fy
+        lengths: NDArray[np.float64] = np.sqrt(1 + x**2 + (y**2)[:, None])
+        return lengths
+
     def depth_to_points(self, depth: NDArray[np.floating]) -> NDArray[np.float64]:
         """Back-project a planar depth image.
 

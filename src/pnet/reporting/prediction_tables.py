@@ -64,11 +64,11 @@ def detection_rows(detections: Detections, part: ParametricPart) -> list[Row]:
     instance = detections.instance.cpu().numpy()
     points = np.bincount(instance[instance >= 0], minlength=len(score))
     turn = rotation_vectors(R)
-    rows = []
+    rows, columns = [], csv_columns(part)
     for rank, i in enumerate(by_score(detections).tolist(), 1):
         lengths = [*(1000 * t[i]), *turn[i], *(1000 * parameters[i])]
         values = [rank, float(score[i]), *map(float, lengths), int(points[i]), *R[i].ravel().tolist()]
-        rows.append(dict(zip(csv_columns(part), values, strict=True)))
+        rows.append(dict(zip(columns, values, strict=True)))
     return rows
 
 

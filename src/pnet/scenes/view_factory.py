@@ -87,17 +87,35 @@ class ViewFactory:
 
     def _measure(self, image: View, rng: np.random.Generator) -> dict[str, NDArray[Any]]:
         """The pixels on bodies as the sensor measures them, as the arrays of a `Scene`."""
-        pixels = np.flatnonzero(image.instance >= 0)
-        v, u = np.divmod(pixels, self.camera.width)
-        cloud = (self.camera.rays(u, v) * image.depth.reshape(-1)[pixels, None]).astype(np.float32)
-        incidence = np.rint(255 * image.incidence.reshape(-1)[pixels]).astype(np.uint8)
-        step = EDGE_SLOPE * float(cloud[:, 2].mean()) / self.camera.fx if len(cloud) else 0.0
-        edge = image_edges(image.depth, step).reshape(-1)[pixels]
-        cloud, kept = self.noise(cloud, incidence / 255, edge, self.camera, rng)
-        found: dict[str, NDArray[Any]] = {"points": cloud, "incidence": incidence, "edge": edge}
+        pixels, found, kept = measured_pixels(image, self.camera, self.noise, rng)
         found["instance"] = image.instance.reshape(-1)[pixels]
         return {name: values[kept] for name, values in found.items()}
 
     @lru_cache(maxsize=256)  # noqa: B019  as long-lived as its process
     def _mesh(self, parameters: tuple[float, ...]) -> trimesh.Trimesh:
         return self.part.mesh(np.array(parameters))
+
+
+def measured_pixels(
+    image: View, camera: Camera, noise: SensorNoise, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], dict[str, NDArray[Any]], NDArray[np.bool_]]:
+    """The pixels on bodies as a sensor measures them.
+
+    Args:
+        image: the exact view. camera: of it. noise: of the sensor. rng: of the noise.
+    Returns:
+        (n,) places in the flattened image; points (n, 3), incidence and edge (n,) as in a `Scene`; (n,) which
+        were measured at all.
+    """
+    pixels = np.flatnonzero(image.instance >= 0)
+    v, u = np.divmod(pixels, camera.width)
+    cloud = (camera.rays(u, v) * image.depth.reshape(-1)[pixels, None]).astype(np.float32)
+    incidence = np.rint(255 * image.incidence.reshape(-1)[pixels]).astype(np.uint8)
+    edge = image_edges(image.depth, edge_step(cloud, camera)).reshape(-1)[pixels]
+    cloud, kept = noise(cloud, incidence / 255, edge, camera, rng)
+    return pixels, {"points": cloud, "incidence": incidence, "edge": edge}, kept
+
+
+def edge_step(cloud: NDArray[np.floating], camera: Camera) -> float:
+    """The step in depth from pixel to pixel that is an edge of an image, metres. cloud: (n, 3) its points."""
+    return EDGE_SLOPE * float(cloud[:, 2].mean()) / camera.fx if len(cloud) else 0.0

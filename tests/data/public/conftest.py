@@ -78,8 +78,8 @@ def take_picture(part: ParametricPart, camera: Camera, bodies: int = len(PLACES)
     return Picture(part, camera, R, t, depth, view.instance, floor, view.occlusion, view.visible)
 
 
-def assert_is_scene(scene: Scene, points: int) -> None:
-    """The promises of `Scene`."""
+def assert_is_scene(scene: Scene, points: int, tolerance: float = 1e-9, measured: bool = True) -> None:
+    """The promises of `Scene`. tolerance: of rotations. measured: it came from a depth image."""
     d, n = len(scene.R), len(scene.points)
     assert n in (0, points)
     assert scene.points.shape == (n, 3) and scene.points.dtype == np.float32
@@ -88,14 +88,15 @@ def assert_is_scene(scene: Scene, points: int) -> None:
     assert ((scene.instance >= 0) & (scene.instance < d)).all()
     assert scene.R.shape == (d, 3, 3) and scene.t.shape == (d, 3)
     assert np.isfinite(scene.t).all()
-    assert np.abs(scene.R @ scene.R.swapaxes(1, 2) - np.eye(3)).max(initial=0) <= 1e-9
+    assert np.abs(scene.R @ scene.R.swapaxes(1, 2) - np.eye(3)).max(initial=0) <= tolerance
     assert (np.linalg.det(scene.R) > 0).all()
     assert scene.parameters.ndim == 2 and len(scene.parameters) == d
     assert np.isfinite(scene.parameters).all() and (scene.parameters > 0).all()
     for share in (scene.visibility, scene.occlusion):
         assert share.shape == (d,) and ((share >= 0) & (share <= 1)).all()
     for values in (scene.incidence, scene.edge):
-        assert values is not None and values.shape == (n,) and values.dtype == np.uint8
+        assert values is not None or not measured
+        assert values is None or (values.shape == (n,) and values.dtype == np.uint8)
 
 
 @pytest.fixture(scope="session", params=["gear", "candlestick"])

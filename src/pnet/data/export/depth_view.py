@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from pnet.data.export.background import Background
 from pnet.geometry.camera import Camera
 from pnet.records import Scene
-from pnet.scenes.edges import image_edges
 from pnet.scenes.noise import NoNoise, SensorNoise
 from pnet.scenes.rendering import View, render_view
-from pnet.scenes.view_factory import EDGE_SLOPE
+from pnet.scenes.view_factory import measured_pixels
 
 Depth = NDArray[np.float64]
 
@@ -93,12 +92,8 @@ class Imaging:
         if isinstance(self.noise, NoNoise) or not len(pixels):
             measured.flat[pixels] = image.depth.flat[pixels]  # exact beyond single precision
             return measured
-        v, u = np.divmod(pixels, camera.width)
-        cloud = (camera.rays(u, v) * image.depth.flat[pixels][:, None]).astype(np.float32)
-        incidence = np.rint(255 * image.incidence.flat[pixels]).astype(np.uint8) / 255
-        edge = image_edges(image.depth, EDGE_SLOPE * float(cloud[:, 2].mean()) / camera.fx).flat[pixels]
-        found, kept = self.noise(cloud, incidence, edge, camera, rng)
-        measured.flat[pixels] = np.where(kept, found[:, 2], np.nan)
+        pixels, found, kept = measured_pixels(image, camera, self.noise, rng)
+        measured.flat[pixels] = np.where(kept, found["points"][:, 2], np.nan)
         return measured
 
 

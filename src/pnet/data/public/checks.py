@@ -118,15 +118,24 @@ def check_poses_fit(scene: Scene, radius: float, where: str) -> None:
     """
     if not (np.isfinite(scene.R).all() and np.isfinite(scene.t).all()):
         raise ValueError(f"{where}: a pose is too far away to be told in numbers")
-    points = np.bincount(scene.instance, minlength=len(scene.t))
-    sums = [np.bincount(scene.instance, x, minlength=len(scene.t)) for x in scene.points.T]
-    seen = points > 0
-    if not seen.any():
+    gap, _ = distances_from_poses(scene)
+    if not len(gap):
         return
-    gap = np.linalg.norm(np.stack(sums, -1)[seen] / points[seen, None] - scene.t[seen], axis=1)
     if not np.median(gap) <= 2 * radius:
         raise ValueError(
             f"{where}: the poses do not fit the depth image: the points of the bodies lie "
             f"{np.median(gap):.3g} m from their origins (median of {len(gap)}), but part {scene.part} "
             f"reaches {radius:.3g} m from its own; are unit, frame (data.source.frame) and part right?"
         )
+
+
+def distances_from_poses(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """How far the mean of a body's points is from its pose's origin.
+
+    Returns:
+        (s,) metres of the bodies that have points, and (s,) which these are.
+    """
+    count = np.bincount(scene.instance, minlength=len(scene.t))
+    sums = [np.bincount(scene.instance, x, minlength=len(scene.t)) for x in scene.points.T]
+    seen = np.flatnonzero(count)
+    return np.linalg.norm(np.stack(sums, -1)[seen] / count[seen, None] - scene.t[seen], axis=1), seen

@@ -3,7 +3,7 @@
 from math import pi, radians, tan
 from pathlib import Path
 
-from pnet.data.json_files import read_json, read_numbers
+from pnet.data.json_files import read_numbers, read_object
 from pnet.data.public.checks import checked_camera
 from pnet.geometry.camera import Camera
 
@@ -24,9 +24,7 @@ def read_camera(path: Path) -> Camera:
     Raises:
         FileNotFoundError, ValueError: names the file and the key.
     """
-    fields = read_json(path)
-    if not isinstance(fields, dict):
-        raise ValueError(f"{path}: holds a {type(fields).__name__}, expected an object")
+    fields = read_object(path)
 
     def number(key: str) -> float:
         return float(read_numbers(fields, key, str(path), ()))

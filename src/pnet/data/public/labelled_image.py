@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pnet.data.json_files import ROTATION_TOLERANCE
 from pnet.geometry.camera import Camera
 from pnet.ops.sampling import farthest_point_order
 from pnet.records import Scene, SceneId
 from pnet.scenes.edges import image_edges
-from pnet.scenes.view_factory import EDGE_SLOPE
+from pnet.scenes.view_factory import edge_step
 
 Points = NDArray[np.float64]
-ROTATION_TOLERANCE = 1e-3
-FARTHEST = 1000.0  # metres; a clip plane beyond it has another unit
+FARTHEST = 1000.0  # metres; a clip plane or a body beyond it has another unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +55,7 @@ def scene_of_image(image: LabelledImage, camera: Camera, part: str, scene_id: Sc
     cloud = (camera.rays(u, v) * flat[pixels, None]).astype(np.float32)
     owner = image.instance.reshape(-1)[pixels]
     seen = np.bincount(image.instance[image.instance >= 0], minlength=len(image.R))
-    step = EDGE_SLOPE * float(cloud[:, 2].mean()) / camera.fx if len(cloud) else 0.0
-    edge = image_edges(np.nan_to_num(image.depth), step).reshape(-1)[pixels]
+    edge = image_edges(np.nan_to_num(image.depth), edge_step(cloud, camera)).reshape(-1)[pixels]
     order = farthest_point_order(cloud, points) if len(cloud) else np.zeros(0, np.int64)
     incidence = incidence_at(image.depth, camera, pixels[order])
     return Scene(

@@ -6,6 +6,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from pnet.data.public.checks import distances_from_poses
 from pnet.geometry.camera import Camera
 from pnet.parts.base import ParametricPart
 from pnet.records import Scene
@@ -69,14 +70,11 @@ def check_bodies_fit(scene: Scene, mesh: trimesh.Trimesh, where: str) -> None:
     if not (np.isfinite(scene.points).all() and (scene.points[:, 2] > 0).all()):
         raise ValueError(f"{where}: points lie behind the camera, or are infinite; expected metres, z > 0")
     radius = float(np.linalg.norm(mesh.vertices, axis=1).max())
-    count = np.bincount(scene.instance, minlength=len(scene.t))
-    total = np.zeros(scene.t.shape)
-    np.add.at(total, scene.instance, scene.points)
-    distance = np.linalg.norm(total / np.maximum(count, 1)[:, None] - scene.t, axis=1) * (count > 0)
+    distance, seen = distances_from_poses(scene)
     if len(distance) and not distance.max() <= 2 * radius:
-        body = int(distance.argmax())
+        worst = int(distance.argmax())
         raise ValueError(
-            f"{where}: points of body {body} are {1000 * distance[body]:.4g} mm from its pose on average, "
-            f"its radius is {1000 * radius:.4g} mm; expected poses in the camera frame, metres, and "
+            f"{where}: points of body {seen[worst]} are {1000 * distance[worst]:.4g} mm from its pose on "
+            f"average, its radius is {1000 * radius:.4g} mm; expected poses in the camera frame, metres, and "
             "the data set's object frame in data.source.frame"
         )

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pnet.data.json_files import read_json, read_numbers
+from pnet.data.json_files import read_numbers, read_object
 from pnet.data.public.checks import checked_camera
 from pnet.geometry.camera import Camera
 
@@ -53,14 +53,7 @@ class RadialDepth:
                 f"(max_val_in_depth of {CAMERA_FILE})"
             )
         distance = self.clip_start + values / self.largest * (self.clip_end - self.clip_start)
-        return np.where(values > 0, distance / ray_lengths(self.camera), 0.0)
-
-
-def ray_lengths(camera: Camera) -> Points:
-    """(height, width) lengths of the pixels' rays with z = 1."""
-    x = (np.arange(camera.width) - camera.cx) / camera.fx
-    y = (np.arange(camera.height) - camera.cy) / camera.fy
-    return np.sqrt(1 + x**2 + (y**2)[:, None])
+        return np.where(values > 0, distance / self.camera.ray_lengths(), 0.0)
 
 
 def find_camera(root: Path, folder: Path) -> RadialDepth | None:
@@ -76,9 +69,7 @@ def find_camera(root: Path, folder: Path) -> RadialDepth | None:
 def read_camera(path: Path) -> RadialDepth:
     """Read a parameter.json; ValueError names the file and the key."""
     check_size(path)
-    fields = read_json(path)
-    if not isinstance(fields, dict):
-        raise ValueError(f"{path}: holds a {type(fields).__name__}, expected an object")
+    fields = read_object(path)
 
     def number(key: str) -> float:
         return float(read_numbers(fields, key, str(path), ()))
@@ -88,7 +79,7 @@ def read_camera(path: Path) -> RadialDepth:
     camera = checked_camera(str(path), size, focal, (number("cu"), number("cv")), clip)
     if largest <= 0:
         raise ValueError(f"{path}: key 'max_val_in_depth' is {largest:g}, expected more than 0")
-    near = clip[0] / float(ray_lengths(camera).max())
+    near = clip[0] / float(camera.ray_lengths().max())
     if near <= 0:
         raise ValueError(f"{path}: key 'clip_start' is {clip[0]:g}, expected metres")
     return RadialDepth(replace(camera, near=near), *clip, largest)

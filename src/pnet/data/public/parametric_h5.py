@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pnet.data.public.labelled_image import FARTHEST
 from pnet.data.public.object_frame import ObjectFrame
 from pnet.data.public.parametric_bodies import check_bodies_fit, part_mesh, silhouettes
-from pnet.data.public.parametric_truth import FARTHEST, check_bodies
+from pnet.data.public.parametric_truth import check_bodies
 from pnet.data.public.public_scenes import Listed
 from pnet.geometry.camera import Camera
 from pnet.ops.sampling import farthest_point_order

@@ -6,13 +6,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pnet.data.public.labelled_image import check_rotations, read_lines
+from pnet.data.public.labelled_image import FARTHEST, check_rotations, read_lines
 from pnet.data.public.parametric_camera import check_size
 from pnet.parts.base import ParametricPart
 
 Points = NDArray[np.float64]
 
-FARTHEST = 1000.0  # metres; what is farther away was not meant in metres
 _LARGEST = 10.0  # metres, of a parameter; likewise
 _POSE = 14  # numbers before the parameters: id, t, R, visibility
 
