@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -376,6 +377,22 @@ def test_only_this_machines_dead_processes_files_go(tmp_path, dead):
     remove_left_overs(tmp_path)
     assert names_in(tmp_path) == stay
     assert len([path for path in tmp_path.rglob("*") if path.is_file()]) == 2 * len(stay)
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="reads Linux's /proc")
+def test_a_dead_process_that_nobody_collected_is_gone(tmp_path):
+    """Its number is still taken: where a container's first process collects no orphans, for ever."""
+    process = subprocess.Popen([sys.executable, "-c", "print()"], stdout=subprocess.PIPE)
+    try:
+        assert process.stdout.read() == b"\n"
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        os.kill(process.pid, 0)  # there, to all appearances
+        left = tmp_path / f".pile.safetensors.{HOST}.{process.pid}.part"
+        left.write_bytes(b"half")
+        remove_left_overs(tmp_path)
+        assert not left.exists()
+    finally:
+        process.communicate()
 
 
 def test_one_processs_files_go_even_while_it_runs(tmp_path, dead):

@@ -193,12 +193,22 @@ def _host() -> str:
 
 def _is_running(temporary: Path) -> bool:
     try:
-        os.kill(int(temporary.name.split(".")[-2]), 0)
+        pid = int(temporary.name.split(".")[-2])
+        os.kill(pid, 0)
     except (ValueError, IndexError, ProcessLookupError):
         return False
     except PermissionError:
         return True
-    return True
+    return not _has_ended(pid)
+
+
+def _has_ended(pid: int) -> bool:
+    """Whether a process is dead but not yet collected by its parent; a container's first may never do so."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except (OSError, IndexError):  # collected in this moment, or no Linux
+        return False
+    return state in "ZX"
 
 
 def _rows(view: Any) -> int:
