@@ -1,5 +1,6 @@
 """What several rooms' tests share: the two templates as the configs have them, a tiny data set's maker."""
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from importlib.util import find_spec
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from omegaconf import OmegaConf
 from scipy.spatial.transform import Rotation
 
@@ -30,6 +32,9 @@ from pnet.scenes.view_factory import ViewFactory
 from pnet.scenes.viewpoints import Viewpoints
 
 CONF = Path(__file__).parents[1] / "conf"
+
+if not torch.cuda.is_available():  # Triton asks once, when something first imports it
+    os.environ["TRITON_INTERPRET"] = "1"
 
 
 class Marble(ParametricPart):

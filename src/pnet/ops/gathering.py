@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pnet.ops.operators import operator
+from pnet.ops.operators import kernel, operator
 
 
 def gather_rows(rows: Tensor, index: Tensor) -> Tensor:
@@ -83,32 +83,39 @@ def _scatter_max(grad: Tensor, winner: Tensor, n: int) -> Tensor:
     return out.scatter_add(1, winner.long(), grad.to(out)).to(grad)
 
 
-@_gather_sum.register_kernel("cpu")
+@kernel(_gather_sum, "cpu")
 def _(rows: Tensor, index: Tensor, weight: Tensor | None) -> Tensor:
     from pnet.ops.cpu import gathering as kernels
 
     return kernels.gather_sum(rows, index, weight)
 
 
-@_scatter_sum.register_kernel("cpu")
+@kernel(_scatter_sum, "cpu")
 def _(rows: Tensor, index: Tensor, weight: Tensor | None, n: int) -> Tensor:
     from pnet.ops.cpu import gathering as kernels
 
     return kernels.scatter_sum(rows, index, weight, n)
 
 
-@_gather_max.register_kernel("cpu")
+@kernel(_gather_max, "cpu")
 def _(rows: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
     from pnet.ops.cpu import gathering as kernels
 
     return kernels.gather_max(rows, index)
 
 
-@_scatter_max.register_kernel("cpu")
+@kernel(_scatter_max, "cpu")
 def _(grad: Tensor, winner: Tensor, n: int) -> Tensor:
     from pnet.ops.cpu import gathering as kernels
 
     return kernels.scatter_max(grad, winner, n)
+
+
+@kernel(_gather_sum, "cuda")
+def _(rows: Tensor, index: Tensor, weight: Tensor | None) -> Tensor:
+    from pnet.ops.cuda import gathering as kernels
+
+    return kernels.gather_sum(rows, index, weight)
 
 
 @_gather_sum.register_fake

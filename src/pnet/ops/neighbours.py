@@ -6,7 +6,7 @@ All of them are exact and break ties by the smaller index, whatever kernel runs.
 import torch
 from torch import Tensor
 
-from pnet.ops.operators import check_clouds, operator, squared, squared_distance
+from pnet.ops.operators import check_clouds, kernel, operator, squared, squared_distance
 
 CHUNK = 2**22  # distances that a reference holds at a time
 
@@ -87,21 +87,21 @@ def _octants(points: Tensor, limit: float) -> Tensor:
     return _by_chunks(lambda p, q, me: _octants_one(p, q, me, limit), points, points, numbered)[0]
 
 
-@_ball_query.register_kernel("cpu")
+@kernel(_ball_query, "cpu")
 def _(points: Tensor, centres: Tensor, limit: float, k: int) -> Tensor:
     from pnet.ops.cpu import neighbours as kernels
 
     return kernels.ball_query(points.contiguous(), centres.contiguous(), limit, k)
 
 
-@_nearest.register_kernel("cpu")
+@kernel(_nearest, "cpu")
 def _(points: Tensor, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
     from pnet.ops.cpu import neighbours as kernels
 
     return kernels.nearest(points.contiguous(), queries.contiguous(), k)
 
 
-@_octants.register_kernel("cpu")
+@kernel(_octants, "cpu")
 def _(points: Tensor, limit: float) -> Tensor:
     from pnet.ops.cpu import neighbours as kernels
 

@@ -2,11 +2,12 @@
 
 Each operator is a `torch.library` custom operator `pnet::…`, so autograd, export and torch.compile know it.
 The function under `@operator` is its plain torch reference and runs on any device; a faster kernel for a
-device registers beside it (`register_kernel("cpu")`, later "cuda") and is imported at its first use.
+device registers beside it (`@kernel(operator, "cpu")`, "cuda") and is imported at its first use.
 """
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from importlib.util import find_spec
 from typing import Any, Protocol, TypeVar, cast
 
 import torch
@@ -30,7 +31,8 @@ class Operator(Protocol):
 
 
 OPERATORS: dict[str, Operator] = {}
-DEVICES = ("cpu",)  # with kernels of their own
+TOOLKITS = {"cpu": "numba", "cuda": "triton"}  # what compiles a device's kernels
+KERNELS: dict[str, list[str]] = {device: [] for device in TOOLKITS}  # the operators that have one there
 
 
 def operator(reference: Callable[..., object]) -> Operator:
@@ -41,13 +43,29 @@ def operator(reference: Callable[..., object]) -> Operator:
     return made
 
 
+def kernel(made: Operator, device: str) -> Callable[[Function], Function]:
+    """Register a device's kernel of an operator.
+
+    Where the toolkit that compiles it is not installed (Triton comes with CUDA builds of torch for Linux, not
+    with others) the reference goes on to serve that device.
+    """
+
+    def register(function: Function) -> Function:
+        if find_spec(TOOLKITS[device]) is None:
+            return function
+        KERNELS[device].append(next(name for name, known in OPERATORS.items() if known is made))
+        return made.register_kernel(device)(function)
+
+    return register
+
+
 @contextmanager
 def plain_operators() -> Iterator[None]:
     """Run the references instead of the kernels, in this whole process: to compare, or to find a fault."""
     with ExitStack() as stack:
-        for made in OPERATORS.values():
-            for device in DEVICES:
-                stack.enter_context(made.set_kernel_enabled(device, enabled=False))
+        for device, names in KERNELS.items():
+            for name in names:
+                stack.enter_context(OPERATORS[name].set_kernel_enabled(device, enabled=False))
         yield
 
 

@@ -5,7 +5,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pnet.ops.operators import check_clouds, operator, squared_distance
+from pnet.ops.operators import check_clouds, kernel, operator, squared_distance
 
 
 def farthest_points(points: Tensor, count: int, start: int = 0) -> Tensor:
@@ -47,7 +47,7 @@ def _farthest_points(points: Tensor, count: int, start: int) -> Tensor:
     return order[:, torch.arange(count, device=points.device) % taken]
 
 
-@_farthest_points.register_kernel("cpu")
+@kernel(_farthest_points, "cpu")
 def _(points: Tensor, count: int, start: int) -> Tensor:
     from pnet.ops.cpu import sampling as kernels
 
