@@ -37,6 +37,19 @@ def gather_sum(rows: Tensor, index: Tensor, weight: Tensor | None = None) -> Ten
     return total
 
 
+def scatter_sum(rows: Tensor, index: Tensor, n: int, weight: Tensor | None = None) -> Tensor:
+    """(Weighted) sums of the rows that are sent to each place: the reverse of `gather_sum`.
+
+    Args:
+        rows: (B, M, C). index: (B, M, k) int64 into n: where each row goes. n: places.
+        weight: (B, M, k), or None for plain sums.
+    Returns:
+        (B, n, C), zeros where nothing is sent; added in the rows' order, so the same in every run.
+    """
+    total: Tensor = _scatter_sum(rows, index, None if weight is None else weight.detach(), n)
+    return total
+
+
 def gather_max(rows: Tensor, index: Tensor) -> Tensor:
     """The largest of the gathered rows, channel by channel, without holding them all.
 
