@@ -81,7 +81,7 @@ class Batch:
         parameters: (B, N, k) label: its parameters, metres.
         visibility: (B, N) label: its visibility.
         scene: (B,) index of each scene in the data set.
-        tables: the backbone's neighbour tables of the points, or None where it finds them itself.
+        tables: the backbone's tables of the points, or None where it finds them itself.
         rotation: (B, N, 3, 3) label: rotation of the instance, part → camera; None where no method asks.
         scale: (B, 3, 3) Λ of each scene's part object in the part frame, metres (λ times the identity for a
             revolution), by which rotations are compared; None likewise.

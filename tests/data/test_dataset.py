@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pnet.data.augmentation import Augmentation
-from pnet.data.dataset import EpochSampler, LabelledScenes, collate, first_points
+from pnet.data.dataset import Collate, EpochSampler, LabelledScenes, first_points
 from pnet.data.scene_folder import SceneFolder
 from pnet.data.scene_order import Permutations
 from pnet.data.targets import point_labels
@@ -97,7 +97,7 @@ def test_more_points_than_stored_are_refused(folder, tn34):
 
 def test_collate_stacks(folder, tn34):
     dataset = LabelledScenes(folder, tn34.chain, CHOICE, points=10)
-    batch = collate([dataset[1], dataset[4]])
+    batch = Collate()([dataset[1], dataset[4]])
     assert batch.points.shape == (2, 10, 3) and batch.keypoints.shape == (2, 10, 3, 3)
     assert batch.scene.tolist() == [1, 4]
     assert torch.equal(batch.centroid[1], dataset[4]["centroid"])

@@ -58,7 +58,7 @@ def test_shapes_of_a_batch(root, tn06):
 @pytest.mark.parametrize("workers", [0, 1])
 def test_the_loader_finds_the_tables_of_the_points_as_augmented(root, tn06, workers):
     pyramid = Pyramid([30, 8], [[Ball(0.01, 6)], [Ball(0.02, 4), Ball(0.04, 4)]], [0.01])
-    data = module(root, tn06, points=100, workers=workers, pyramid=pyramid)
+    data = module(root, tn06, points=100, workers=workers, tables=pyramid)
     for batch in (next(iter(data.train_dataloader())), next(iter(data.val_dataloader()))):
         expected = pyramid(batch.points)
         assert batch.tables.keys() == expected.keys() and len(expected) == 8

@@ -175,28 +175,29 @@ def test_training_learns(root, tn34, tmp_path):
     assert len(losses) == 9 and sum(losses[-3:]) < sum(losses[:3])
 
 
-def test_throughput_counts_scenes_and_leaves_validation_out(monkeypatch):
+@pytest.mark.parametrize("every, rates", [(1, [6, 4, 6]), (2, [12 / 2.5]), (3, [18 / 3.5])])
+def test_throughput_counts_scenes_and_leaves_validation_out(monkeypatch, every, rates):
     times = iter([10.0, 11.0, 12.5, 100.0, 101.0])
     monkeypatch.setattr("pnet.engine.callbacks.perf_counter", lambda: next(times))
     logged = []
     module = SimpleNamespace(log=lambda name, value, **_: logged.append(value))
     batch = SimpleNamespace(points=torch.zeros(6, 1, 3))
-    throughput, trainer = Throughput(), SimpleNamespace(world_size=1)
-    throughput.on_train_batch_start(trainer, module)
-    throughput.on_train_batch_end(trainer, module, None, batch, 0)
-    throughput.on_train_batch_start(trainer, module)
-    throughput.on_train_batch_end(trainer, module, None, batch, 1)
-    throughput.on_validation_start(trainer, module)
-    throughput.on_train_batch_start(trainer, module)  # at 100: the pause does not count
-    throughput.on_train_batch_end(trainer, module, None, batch, 2)
+    throughput, trainer = Throughput(), SimpleNamespace(world_size=1, log_every_n_steps=every)
+    for step in (1, 2, 3):
+        throughput.on_train_batch_start(trainer, module)  # the third at 100: the pause does not count
+        trainer.global_step = step
+        throughput.on_train_batch_end(trainer, module, None, batch, step - 1)
+        if step == 2:
+            throughput.on_validation_start(trainer, module)
     assert throughput.scenes == 18 and throughput.seconds == pytest.approx(3.5)
-    assert logged == pytest.approx([6, 4, 6])
+    assert logged == pytest.approx(rates)
 
 
 def test_throughput_goes_on_from_a_checkpoint_and_counts_every_process(monkeypatch):
     times = iter([0.0, 2.0])
     monkeypatch.setattr("pnet.engine.callbacks.perf_counter", lambda: next(times))
-    module, trainer = SimpleNamespace(log=lambda *_, **__: None), SimpleNamespace(world_size=3)
+    module = SimpleNamespace(log=lambda *_, **__: None)
+    trainer = SimpleNamespace(world_size=3, global_step=1, log_every_n_steps=10)
     throughput = Throughput()
     throughput.load_state_dict({"scenes": 10, "seconds": 4.0})
     throughput.on_train_batch_start(trainer, module)

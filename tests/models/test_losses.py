@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from pnet.data.dataset import collate
+from pnet.data.dataset import Collate
 from pnet.data.targets import point_labels
 from pnet.models.losses import Norm, ParametricLoss
 from pnet.parts.choice import KeypointChoice
@@ -21,7 +21,7 @@ INF = math.inf
 def batch(part, make_scene) -> Batch:
     scenes = [make_scene(part, seed=seed, points=30) for seed in (0, 1)]
     items = [point_labels(scene, part.chain, KeypointChoice()) for scene in scenes]
-    return collate([{**item, "scene": torch.tensor(i)} for i, item in enumerate(items)])
+    return Collate()([{**item, "scene": torch.tensor(i)} for i, item in enumerate(items)])
 
 
 def perfect(batch: Batch) -> PointPrediction:

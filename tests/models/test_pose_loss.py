@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tests.conftest import CONF, Marble, load_part
 
 from pnet.cli.instantiate import instantiate
-from pnet.data.dataset import collate
+from pnet.data.dataset import Collate
 from pnet.data.targets import point_labels, pose_labels
 from pnet.geometry.symmetry import (
     FLIP,
@@ -66,7 +66,7 @@ def labelled(part, make_scene, points=25) -> Batch:
         scene = make_scene(part, seed=seed, points=points)
         labels = point_labels(scene, part.chain, KeypointChoice())
         items.append({**labels, **pose_labels(scene, part), "scene": torch.tensor(i)})
-    return collate(items)
+    return Collate()(items)
 
 
 @pytest.fixture

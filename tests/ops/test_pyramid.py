@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, Dataset, default_collate
 
-from pnet.data.dataset import LabelledScenes, collate
+from pnet.data.dataset import Collate, LabelledScenes
 from pnet.data.scene_folder import SceneFolder
 from pnet.ops.neighbours import ball_query, octants, three_nearest
 from pnet.ops.operators import plain_operators
@@ -128,11 +128,11 @@ def test_a_loader_s_tables_are_the_network_s(workers):
         assert torch.equal(torch.cat([batch["tables"][name] for batch in batches]), table), name
 
 
-def test_labelled_scenes_carry_tables_where_a_pyramid_is_given(tmp_path, tn34, write_split):
+def test_a_batch_carries_tables_where_a_pyramid_is_given(tmp_path, tn34, write_split):
     write_split(tmp_path, tn34, "train", cycles=1)
     scenes = SceneFolder(tmp_path, "train", "tn34")
-    plain = LabelledScenes(scenes, tn34.chain, KeypointChoice(), 64)
-    assert "tables" not in plain[0] and collate([plain[0]]).tables is None
-    batch = collate([*LabelledScenes(scenes, tn34.chain, KeypointChoice(), 64, pyramid=PYRAMID)])
+    labelled = [*LabelledScenes(scenes, tn34.chain, KeypointChoice(), 64)]
+    assert Collate()(labelled).tables is None
+    batch = Collate(PYRAMID)(labelled)
     assert batch.points.shape == (3, 64, 3) and batch.tables is not None
     assert all(torch.equal(batch.tables[name], table) for name, table in PYRAMID(batch.points).items())

@@ -11,8 +11,7 @@ class Backbone(nn.Module, ABC):
     """Per-point features of a cloud.
 
     Attributes:
-        features: F, channels of the output. pyramid: the neighbour tables that it needs and that depend on
-            one cloud alone, so that a data loader can find them; None: nothing of the kind.
+        features: F, channels of the output. pyramid: the neighbour tables that it needs; None: no such.
         batches_agree: whether a cloud's features are the same in any batch (in evaluation, up to rounding).
     """
 
@@ -21,7 +20,7 @@ class Backbone(nn.Module, ABC):
     batches_agree: bool = True
 
     def tables(self, points: Tensor) -> Tables:
-        """Neighbour tables of clouds; found once, outside autograd. One that overrides this has no `pyramid`.
+        """What depends on the clouds' geometry alone; found once, outside autograd, here or by a data loader.
 
         Args:
             points: (B, N, 3) metres, camera frame, in farthest-point-sampling order.

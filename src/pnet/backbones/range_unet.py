@@ -71,7 +71,8 @@ class RangeUNet(Backbone):
 
         Returns:
             cell (B, N) int64, local (B, N, 3): offset from the cell's middle in cells and depth from the
-            cloud's mean in units of depth_scale; size (2,) int64 rows and columns.
+            cloud's mean in units of depth_scale; grid (rows, columns, 0), whose shape alone counts: numbers
+            in a tensor would have to be read back from the device.
         """
         with torch.no_grad():
             direction = points[..., :2] / points[..., 2:] / self._angle
@@ -87,12 +88,13 @@ class RangeUNet(Backbone):
             depth = points[..., 2:] - points[..., 2:].mean(1, keepdim=True)
             local = torch.cat([place - whole - 0.5, depth / self._depth_scale], -1)
             cell = whole[..., 1].long() * size[0] + whole[..., 0].long()
-            return {"cell": cell, "local": local, "size": size.flip(0)}
+            columns, rows = size.tolist()  # on a device the only wait: let a data loader find the tables
+            return {"cell": cell, "local": local, "grid": local.new_empty(rows, columns, 0)}
 
     def forward(self, points: Tensor, tables: Tables) -> Tensor:
         """Cells → U-Net → back to the points."""
         cell, local = tables["cell"], tables["local"]
-        rows, columns = tables["size"].tolist()
+        rows, columns = tables["grid"].shape[:2]
         image = self._unet(_rasterise(cell, local, rows, columns))
         at_points = gather_rows(image.flatten(2).mT, cell)
         features: Tensor = self.leave(torch.cat([at_points.to(local), local], -1))

@@ -6,6 +6,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
@@ -152,13 +153,25 @@ def _guarded(task: Task) -> Task:
 
     def guarded(cfg: DictConfig) -> None:
         try:
-            task(cfg)
+            with chosen_operators(cfg.get("ops")):
+                task(cfg)
         except EXPECTED as fault:
             if HydraConfig.get().mode == RunMode.MULTIRUN:  # a launcher would not see a SystemExit's reason
                 raise RuntimeError(error_text(fault)) from fault
             fail(fault)
 
     return guarded
+
+
+def chosen_operators(choice: str | None) -> AbstractContextManager[None]:
+    """The setting `ops`: compiled kernels, or the plain torch references in their place."""
+    if choice not in (None, "kernels", "reference"):
+        raise ValueError(f"ops is {choice!r}, choose kernels or reference")
+    if choice != "reference":
+        return nullcontext()
+    from pnet.ops.operators import plain_operators  # torch takes seconds to import
+
+    return plain_operators()
 
 
 def _check_launcher(arguments: list[str]) -> None:

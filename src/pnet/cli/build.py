@@ -1,5 +1,6 @@
 """Objects out of a config: what training and evaluation share."""
 
+import os
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -16,6 +17,7 @@ from pnet.cli.instantiate import instantiate
 from pnet.cli.settings import is_trained, read_run
 from pnet.data.module import SceneDataModule
 from pnet.data.source import DataSource, StoredData
+from pnet.ops.operators import KERNELS
 from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointRule
 from pnet.postprocess.pipeline import PoseRecovery
@@ -76,14 +78,26 @@ def build_data(cfg: DictConfig, parts: Parts) -> SceneDataModule:
         cfg.data.batch_size,
         cfg.trainer.checkpoint_every * cfg.data.batch_size,
         cfg.data.val_every,
-        cfg.data.workers,
+        loader_workers(cfg.data.workers, cfg.trainer.accelerator),
         cfg.seed,
-        parts.backbone.pyramid,
+        None if finds_tables_itself(parts.backbone, cfg.trainer.accelerator) else parts.backbone.tables,
         share("data.learn", cfg.data.learn),
         instantiate(cfg.views),
         instantiate(cfg.noise),
         None if cfg.data.clutter is None else share("data.clutter", cfg.data.clutter),
     )
+
+
+def finds_tables_itself(backbone: Backbone, accelerator: str) -> bool:
+    """Whether neighbour tables are found where the network runs: a GPU with kernels outruns the loaders."""
+    return backbone.pyramid is not None and device_of(accelerator) == "cuda" and bool(KERNELS["cuda"])
+
+
+def loader_workers(setting: int | None, accelerator: str) -> int:
+    """Loader processes: as many as set; by default some beside a GPU, none that would share a CPU's cores."""
+    if setting is not None:
+        return setting
+    return min(os.cpu_count() or 1, 8) if device_of(accelerator) == "cuda" else 0
 
 
 def open_source(data: DictConfig) -> DataSource:

@@ -1,6 +1,7 @@
 """A network's training: the Lightning trainer, checkpoints to go on from, and what is written beside them."""
 
 import os
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +50,7 @@ def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
         instantiate(cfg.schedule),
         bf16,
         {**identity(cfg), "data": settings_fingerprint(data.source.manifest())},
+        compiled(cfg.trainer),
     )
     throughput = Throughput()
     estimator = NetworkMethod(parts.part, parts.network, parts.recovery, bf16)
@@ -82,6 +84,22 @@ def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
         "recipe": recipe_text(training_settings(cfg)),
         "network": vars(summary),
     }
+
+
+def compiled(trainer: DictConfig) -> bool:
+    """Whether torch.compile makes the network's code; absent in the settings of earlier runs.
+
+    Raises:
+        ValueError: on a CPU without a C++ compiler.
+    """
+    from pnet.cli.build import device_of
+
+    if not trainer.get("compile"):
+        return False
+    names = [name for name in (os.environ.get("CXX"), "g++", "clang++", "c++") if name]
+    if device_of(trainer.accelerator) == "cpu" and not any(map(shutil.which, names)):
+        raise ValueError("trainer.compile=true needs a C++ compiler on a CPU: install g++, or leave it out")
+    return True
 
 
 def is_helper() -> bool:
@@ -176,7 +194,10 @@ def build_trainer(cfg: DictConfig, run: Path, callbacks: list["lightning.Callbac
     from lightning.pytorch.callbacks import LearningRateMonitor, RichProgressBar
     from lightning.pytorch.loggers import TensorBoardLogger
 
+    from pnet.cli.build import device_of
+
     options = cfg.trainer
+    on_cpu = device_of(options.accelerator) == "cpu"
     if not isinstance(options.devices, int) or options.devices < 1:
         raise ValueError(f"trainer.devices is {options.devices}, expected a number of at least 1")
     if options.validate_every % options.checkpoint_every:
@@ -199,7 +220,8 @@ def build_trainer(cfg: DictConfig, run: Path, callbacks: list["lightning.Callbac
         check_val_every_n_epoch=options.validate_every // options.checkpoint_every,
         gradient_clip_val=options.clip,
         logger=TensorBoardLogger(run, name="tensorboard", version="", default_hp_metric=False),
-        callbacks=[*callbacks, LearningRateMonitor("step"), RichProgressBar()],
+        # what the bar shows is read back from the device
+        callbacks=[*callbacks, LearningRateMonitor("step"), RichProgressBar(1 if on_cpu else 20)],
         log_every_n_steps=min(10, options.checkpoint_every),
         num_sanity_val_steps=0,
         enable_model_summary=False,

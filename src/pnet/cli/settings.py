@@ -16,8 +16,11 @@ DECIDE_NOTHING = (
     "evaluate",
     "sweep",
     "dry_run",
+    "ops",
     "data.generate",
+    "data.workers",
     "trainer.threads",
+    "trainer.compile",
 )
 
 

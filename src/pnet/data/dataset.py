@@ -1,7 +1,7 @@
 """A torch Dataset of labelled scenes, and the order in which training sees them."""
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,14 +12,15 @@ from pnet.data.augmentation import Augmentation
 from pnet.data.scene_order import SceneOrder
 from pnet.data.targets import point_labels, pose_labels
 from pnet.data.views import SceneSource
-from pnet.ops.pyramid import Pyramid, Tables
+from pnet.ops.pyramid import Tables
 from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointChoice
 from pnet.parts.keypoints import KeypointChain
 from pnet.records import Batch, Scene
 
 Draw = tuple[int, int]  # scene index and place in the training: all that chance depends on, besides the seed
-Item = dict[str, Tensor | Tables]  # what a scene gives a batch, by name
+Item = dict[str, Tensor]  # what a scene gives a batch, by name
+FindTables = Callable[[Tensor], Tables]  # clouds (B, N, 3) to what a backbone needs to know of them
 
 
 class LabelledScenes(Dataset[Item]):
@@ -29,7 +30,6 @@ class LabelledScenes(Dataset[Item]):
         scenes: where they come from. chain: the part's keypoints. choice: which equivalent is the label.
         points: take the first so many of each scene's points (they are in sampling order), or None.
         augmentation: for training, else None. seed: of the augmentation.
-        pyramid: the backbone's neighbour tables to find here, by the loader's workers; None: none.
         posed: the part, for a method that is taught poses; None: no such labels.
     """
 
@@ -41,7 +41,6 @@ class LabelledScenes(Dataset[Item]):
         points: int | None = None,
         augmentation: Augmentation | None = None,
         seed: int = 0,
-        pyramid: Pyramid | None = None,
         posed: ParametricPart | None = None,
     ) -> None:
         if points is not None and points > scenes.points_per_scene:
@@ -51,8 +50,7 @@ class LabelledScenes(Dataset[Item]):
             )
         self.scenes, self.points = scenes, points
         self._chain, self._choice = chain, choice
-        self._augmentation, self._seed, self._pyramid = augmentation, seed, pyramid
-        self._posed = posed
+        self._augmentation, self._seed, self._posed = augmentation, seed, posed
 
     def __len__(self) -> int:
         return len(self.scenes)
@@ -72,8 +70,6 @@ class LabelledScenes(Dataset[Item]):
         item: Item = {**labels, "scene": torch.tensor(index)}
         if self._posed is not None:
             item.update(pose_labels(scene, self._posed))
-        if self._pyramid is not None:  # of the points as augmented: octants follow the axes
-            item["tables"] = {k: v[0] for k, v in self._pyramid(labels["points"][None]).items()}
         return item
 
 
@@ -85,9 +81,20 @@ def first_points(scene: Scene, count: int | None) -> Scene:
     return replace(scene, **{name: a[:count] for name, a in arrays.items() if a is not None})
 
 
-def collate(items: list[Item]) -> Batch:
-    """Stack labelled scenes, and their tables."""
-    return Batch(**default_collate(items))
+@dataclass(frozen=True)
+class Collate:
+    """Stacks labelled scenes.
+
+    Attributes:
+        tables: finds the backbone's tables of the batch, here in the loader; None: the network does.
+    """
+
+    tables: FindTables | None = None
+
+    def __call__(self, items: list[Item]) -> Batch:
+        """The batch; its tables are of the points as augmented: octants follow the axes."""
+        batch = Batch(**default_collate(items))
+        return batch if self.tables is None else replace(batch, tables=self.tables(batch.points))
 
 
 class EpochSampler(Sampler[Draw]):

@@ -9,11 +9,10 @@ import torch
 from torch.utils.data import DataLoader
 
 from pnet.data.augmentation import Augmentation
-from pnet.data.dataset import EpochSampler, LabelledScenes, collate
+from pnet.data.dataset import Collate, EpochSampler, FindTables, LabelledScenes
 from pnet.data.scene_order import mixed_order
 from pnet.data.source import DataSource, SceneSet
 from pnet.data.views import SceneSource, StoredViews, Views
-from pnet.ops.pyramid import Pyramid
 from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointChoice, KeypointRule
 from pnet.parts.spread import spread_order
@@ -53,7 +52,7 @@ class SceneDataModule(lightning.LightningDataModule):
         points: N, the first so many of a scene's points; None: all.
         batch_size: scenes. draws: scenes of an epoch; None: each once.
         val_every: keep every so many validation scenes. workers: loader processes. seed: of order and chance.
-        pyramid: the backbone's neighbour tables for the loaders to find, or None.
+        tables: finds the backbone's tables of clouds (B, N, 3) in the loaders; None: the network does.
         views: where the training's scenes come from; None: the stored ones. noise: added to them; None: none.
         clutter: share of clutter scenes among those that a training draws; None: as many as there are.
         learn: share of the training's part objects that are learnt, spread over the grid, in (0, 1] (the
@@ -72,7 +71,7 @@ class SceneDataModule(lightning.LightningDataModule):
         val_every: int,
         workers: int,
         seed: int,
-        pyramid: Pyramid | None = None,
+        tables: FindTables | None = None,
         learn: float = 1.0,
         views: Views | None = None,
         noise: SensorNoise | None = None,
@@ -88,7 +87,7 @@ class SceneDataModule(lightning.LightningDataModule):
         self.part, self.source, self.targets, self.points = part, source, targets, points
         self._augmentation, self._batch_size, self._draws = augmentation, batch_size, draws
         self._val_every, self._workers, self._seed = val_every, workers, seed
-        self._pyramid, self._learn = pyramid, learn
+        self._tables, self._learn = tables, learn
         self._views, self._noise, self._clutter = views or StoredViews(), noise or NoNoise(), clutter
 
     def scenes(self, split: str, every: int = 1) -> SceneSet:
@@ -115,7 +114,6 @@ class SceneDataModule(lightning.LightningDataModule):
             self.points,
             self._augmentation,
             self._seed,
-            self._pyramid,
             self._posed,
         )
         if (self._draws or len(scenes)) < self._batch_size:
@@ -142,7 +140,6 @@ class SceneDataModule(lightning.LightningDataModule):
             self.part.chain,
             self.targets.choice,
             self.points,
-            pyramid=self._pyramid,
             posed=self._posed,
         )
         return self._loader(dataset, None, drop_last=False)
@@ -162,6 +159,6 @@ class SceneDataModule(lightning.LightningDataModule):
             num_workers=self._workers,
             persistent_workers=self._workers > 0,
             pin_memory=torch.cuda.is_available(),
-            collate_fn=collate,
+            collate_fn=Collate(self._tables),
             generator=torch.Generator().manual_seed(self._seed),
         )

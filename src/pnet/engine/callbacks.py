@@ -60,7 +60,7 @@ class PoseValidation(lightning.Callback):
 
 
 class Throughput(lightning.Callback):
-    """Scenes per second of the training, logged and kept.
+    """Scenes per second of the training, kept, and logged as often as the losses.
 
     Attributes:
         scenes, seconds: seen and spent by the training, also before an interruption; validation left out.
@@ -69,6 +69,7 @@ class Throughput(lightning.Callback):
     def __init__(self) -> None:
         self.scenes, self.seconds = 0, 0.0
         self._start: float | None = None
+        self._logged = 0, 0.0  # scenes and seconds at the last entry
 
     def state_dict(self) -> dict[str, float]:
         """Kept in checkpoints."""
@@ -77,6 +78,7 @@ class Throughput(lightning.Callback):
     def load_state_dict(self, state_dict: dict[str, float]) -> None:
         """Of the checkpoint that a training goes on from."""
         self.scenes, self.seconds = int(state_dict["scenes"]), state_dict["seconds"]
+        self._logged = self.scenes, self.seconds
 
     def on_train_batch_start(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, *_: object
@@ -98,9 +100,13 @@ class Throughput(lightning.Callback):
         size = len(batch.points) * trainer.world_size  # type: ignore[attr-defined]
         self.scenes += size
         if self._start is not None:
-            pl_module.log("train/scenes_per_second", size / (now - self._start), prog_bar=True)
             self.seconds += now - self._start
         self._start = now
+        # a logged number goes to the device, and waits for it
+        if trainer.global_step % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
+            scenes, seconds = self.scenes - self._logged[0], self.seconds - self._logged[1]
+            pl_module.log("train/scenes_per_second", scenes / max(seconds, 1e-9), prog_bar=True)
+            self._logged = self.scenes, self.seconds
 
     def on_validation_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Stop the clock."""

@@ -15,6 +15,7 @@ from pnet.models.losses import Loss
 from pnet.records import Batch
 
 Optimization = Callable[[Iterable[Parameter]], Optimizer]
+Predict = Callable[..., Any]  # points and tables to predictions
 
 
 class PoseTraining(lightning.LightningModule):
@@ -25,6 +26,7 @@ class PoseTraining(lightning.LightningModule):
         optimizer: makes an optimiser of parameters. schedule: learning rate by step.
         bf16: run the network in bfloat16 autocast.
         identity: plain values kept in every checkpoint, by which `check_identity` knows its own.
+        compiled: let torch.compile make the network's code, for the training steps.
     """
 
     def __init__(
@@ -35,16 +37,19 @@ class PoseTraining(lightning.LightningModule):
         schedule: Schedule,
         bf16: bool,
         identity: dict[str, str],
+        compiled: bool = False,
     ) -> None:
         super().__init__()
         self.network = network
+        # in a tuple, so that it is no submodule: checkpoints know the network alone
+        self._trained: tuple[Predict] = (torch.compile(network) if compiled else network,)
         self.loss = loss
         self._optimizer, self._schedule = optimizer, schedule
         self._bf16, self.identity = bf16, identity
 
     def training_step(self, batch: Batch, index: int) -> Tensor:
         """Loss of a batch; each module's own is logged."""
-        losses = self._losses(batch)
+        losses = self._losses(self._trained[0], batch)
         self._log("train", losses, len(batch.points))
         for tag, value in self.loss.remarks(batch).items():
             self.log(tag, value, batch_size=len(batch.points))
@@ -52,7 +57,7 @@ class PoseTraining(lightning.LightningModule):
 
     def validation_step(self, batch: Batch, index: int) -> None:
         """Losses on validation scenes."""
-        self._log("val", self._losses(batch), len(batch.points))
+        self._log("val", self._losses(self.network, batch), len(batch.points))
 
     def configure_optimizers(self) -> Any:
         """The optimiser and its schedule, stepped after every batch."""
@@ -76,9 +81,9 @@ class PoseTraining(lightning.LightningModule):
         """Refuse a checkpoint of another part or network."""
         check_identity(checkpoint, self.identity)
 
-    def _losses(self, batch: Batch) -> dict[str, Tensor]:
+    def _losses(self, network: Predict, batch: Batch) -> dict[str, Tensor]:
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16):
-            predicted = self.network(batch.points, batch.tables)
+            predicted = network(batch.points, batch.tables)
         return self.loss(predicted, batch)
 
     def _log(self, stage: str, losses: dict[str, Tensor], size: int) -> None:

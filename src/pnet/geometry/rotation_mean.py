@@ -6,6 +6,7 @@ import roma
 import torch
 from torch import Tensor
 
+from pnet.geometry.constants import converted
 from pnet.geometry.symmetry import FiniteSymmetry, RevolutionSymmetry, SphericalSymmetry, Symmetry
 
 STARTS = 12  # hypotheses from which the climb to a mode starts
@@ -67,7 +68,7 @@ def _alignment(
         return 1 + 2 * torch.where(turned, -cosine, cosine), turned.long()
     products = R.mT.flatten(-3, -2) @ mean.transpose(-3, -2).flatten(-2)  # Rᵀ mean of every pair
     products = products.unflatten(-1, (-1, 3)).unflatten(-3, (-1, 3)).movedim(-2, -4).flatten(-2)
-    best = (products @ symmetry.rotations.to(R).flatten(-2).mT).max(-1)
+    best = (products @ converted(symmetry.rotations, R).flatten(-2).mT).max(-1)
     return best.values, best.indices
 
 
@@ -85,7 +86,7 @@ def _average(
         signed = pull * (1 - 2 * element)
         axis = (signed[..., None, :] @ R[..., 2]).squeeze(-2)
         return _tilted(old, torch.nn.functional.normalize(axis + 1e-12 * old[..., 2], dim=-1))
-    G = symmetry.rotations.to(R)
+    G = converted(symmetry.rotations, R)
     # first the sum of those with the same element, then the elements
     shares = pull.new_zeros(*pull.shape, len(G)).scatter(-1, element[..., None], pull[..., None])
     sums = (shares.mT @ R.flatten(-2)).unflatten(-1, (3, 3))

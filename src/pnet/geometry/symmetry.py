@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pnet.geometry.constants import converted
+
 
 @dataclass(frozen=True, eq=False)
 class FiniteSymmetry:
@@ -74,6 +76,7 @@ def dihedral(n: int) -> FiniteSymmetry:
 
 
 FLIP = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))  # half turn about x
+_HALF_TURN = torch.tensor(FLIP, dtype=torch.float64)
 
 
 def reflection(normal: tuple[float, float, float]) -> Tensor:
@@ -97,7 +100,7 @@ def full_group(symmetry: Symmetry, mirror: Tensor | None = None) -> Tensor:
         case FiniteSymmetry(rotations=G):
             return G if mirror is None else torch.cat([G, _mirrored(G, mirror)])
         case RevolutionSymmetry(rotoreflection=True):
-            group = torch.stack([eye, torch.tensor(FLIP, dtype=torch.float64)])
+            group = torch.stack([eye, _HALF_TURN])
         case _:
             group = eye[None]
     if mirror is not None:
@@ -134,14 +137,14 @@ def nearest_equivalent(R: Tensor, reference: Tensor, symmetry: Symmetry) -> Tens
     R, reference = torch.broadcast_tensors(R, reference)
     match symmetry:
         case FiniteSymmetry(rotations=rotations):
-            G = rotations.to(R)
+            G = converted(rotations, R)
             closeness = (R.mT @ reference).flatten(-2) @ G.flatten(-2).mT  # trace(referenceᵀ R g)
             return R @ G[closeness.argmax(-1)]
         case RevolutionSymmetry(rotoreflection=reflected):
             turned = _turn_nearest(R, reference)
             if not reflected:
                 return turned
-            flipped = _turn_nearest(R @ torch.tensor(FLIP).to(R), reference)
+            flipped = _turn_nearest(R @ converted(_HALF_TURN, R), reference)
             axis = reference[..., 2]
             nearer = (flipped[..., 2] * axis).sum(-1) > (turned[..., 2] * axis).sum(-1)
             return torch.where(nearer[..., None, None], flipped, turned)

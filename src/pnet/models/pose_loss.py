@@ -5,6 +5,7 @@ from enum import StrEnum
 import torch
 from torch import Tensor
 
+from pnet.geometry.constants import converted
 from pnet.geometry.symmetry import FiniteSymmetry, RevolutionSymmetry
 from pnet.parts.base import ParametricPart
 from pnet.records import Batch, PosePrediction
@@ -70,7 +71,7 @@ class PoseLoss:
         """(...) metres; R, truth: (..., 3, 3); scale: (..., 3, 3) Λ, broadcast against them."""
         match self._part.symmetry:
             case FiniteSymmetry(rotations=G):
-                nearest = self._nearest_equivalent(R, truth, G.to(R), scale)
+                nearest = self._nearest_equivalent(R, truth, converted(G, R), scale)
                 return self._length(((R - nearest) @ scale).flatten(-2))
             case RevolutionSymmetry(rotoreflection=reflected):
                 axis, true = R[..., 2], truth[..., 2]

@@ -4,6 +4,7 @@ symmetry."""
 import torch
 from torch import Tensor
 
+from pnet.geometry.constants import converted
 from pnet.parts.primitives import Freedom, Primitive
 
 
@@ -15,7 +16,7 @@ def along_and_radial(primitive: Primitive, step: Tensor) -> tuple[Tensor, Tensor
             return step, torch.zeros_like(step)
         case Freedom.SPHERE:
             return torch.zeros_like(step), step
-    axis = primitive.axis.to(step)
+    axis = converted(primitive.axis, step)
     along = (step @ axis)[..., None] * axis
     return along, step - along
 

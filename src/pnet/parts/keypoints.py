@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pnet.geometry.constants import converted
 from pnet.geometry.symmetry import Symmetry, full_group
 from pnet.parts.choice import Judge, KeypointChoice, KeypointRule, NearestToCamera, first_by
 from pnet.parts.declaration import check_circles, check_declaration
@@ -103,7 +104,7 @@ class KeypointChain:
         """
         places = [torch.zeros_like(parameters[..., :1]).expand(*parameters.shape[:-1], 3)]
         for keypoint, reference in zip(self.keypoints, self.reference, strict=True):
-            start, direction = places[reference], keypoint.primitive.direction.to(parameters)
+            start, direction = places[reference], converted(keypoint.primitive.direction, parameters)
             match keypoint:
                 case Keypoint(parameter=str() as name, factor=factor):
                     distance = factor * parameters[..., self.parameters.index(name)]
@@ -177,18 +178,22 @@ class KeypointChain:
         Returns:
             (..., k) metres; a parameter that several keypoints measure is their mean.
         """
+        lengths = torch.linalg.vector_norm(self.steps(keypoints, centroid), dim=-1).unbind(-1)
         columns = []
         for name in self.parameters:
-            measured = [i for i, keypoint in enumerate(self.keypoints) if keypoint.parameter == name]
-            steps = self.steps(keypoints, centroid)[..., measured, :]
-            factor = steps.new_tensor([self.keypoints[i].factor for i in measured])
-            columns.append((torch.linalg.vector_norm(steps, dim=-1) / factor).mean(-1))
+            measured = [
+                length / keypoint.factor
+                for length, keypoint in zip(lengths, self.keypoints, strict=True)
+                if keypoint.parameter == name
+            ]
+            columns.append(torch.stack(measured, -1).mean(-1))
         return torch.stack(columns, -1)
 
     def steps(self, keypoints: Tensor, centroid: Tensor | None = None) -> Tensor:
         """From each keypoint's reference to it, (..., m, 3); centroid (..., 3), None: the origin."""
-        origin = torch.zeros_like(keypoints[..., :1, :]) if centroid is None else centroid[..., None, :]
-        return keypoints - torch.cat([origin, keypoints], -2)[..., self.reference, :]
+        places = [torch.zeros_like(keypoints[..., 0, :]) if centroid is None else centroid]
+        places += keypoints.unbind(-2)  # not by a list of indices: that would wait for the device
+        return keypoints - torch.stack([places[i] for i in self.reference], -2)
 
     def place_like(self, template: Tensor, observed: Tensor) -> Tensor:
         """Template keypoints with the free ones (on circles and spheres) where an observation has them.
@@ -233,7 +238,8 @@ class KeypointChain:
         ):
             along, radial = along_and_radial(keypoint.primitive, step)
             if keypoint.primitive.freedom is not Freedom.NONE:
-                template = along_and_radial(keypoint.primitive, keypoint.primitive.direction.to(step))[1]
+                direction = converted(keypoint.primitive.direction, step)
+                template = along_and_radial(keypoint.primitive, direction)[1]
                 length = torch.linalg.vector_norm(radial, dim=-1, keepdim=True)
                 radial = length * torch.nn.functional.normalize(template, dim=-1)
             places.append(places[self.reference[i]] + along + radial)
