@@ -2,6 +2,7 @@
 loop over instances for the fits.
 
 python benchmarks/bench_postprocess.py
+python benchmarks/bench_postprocess.py --device cuda --scenes 8
 """
 
 import argparse
@@ -24,8 +25,8 @@ from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointChoice, NearestToPoint
 from pnet.postprocess.cluster import CentroidClusters
 from pnet.postprocess.fit import fit_pose
+from pnet.postprocess.grouping import clusters_of
 from pnet.postprocess.pipeline import PoseRecovery
-from pnet.postprocess.vote import PointVotes
 from pnet.records import PointPrediction
 
 INSTANCES, POINTS = 60, 16384
@@ -50,10 +51,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=11)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--scenes", type=int, default=1, help="that are recovered together")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     print(
-        f"{platform.processor() or platform.machine()}, {arguments.threads} threads, "
+        f"{processor(arguments.device)}, {arguments.threads} threads, {arguments.scenes} scenes together, "
         f"medians of {arguments.repeats}, torch {torch.__version__}"
     )
     print(f"milliseconds a scene of {INSTANCES} instances, {POINTS} points")
@@ -63,35 +66,59 @@ def main() -> None:
             recovery = instantiate(compose("train", overrides=[f"postprocess={setting}"]).postprocess)
         for name in PARTS:
             part = instantiate(OmegaConf.load(config_dir() / "part" / f"{name}.yaml"))
-            row = zip(times(part, recovery, arguments.repeats), COLUMNS.values(), strict=True)
+            by_point = not recovery.voting.filters_keypoints
+            said = predictions(part, by_point, arguments.scenes, torch.device(arguments.device))
+            row = zip(times(part, recovery, said, arguments.repeats), COLUMNS.values(), strict=True)
             print(f"{name:6}{setting:>9}" + "".join(f"{value:{width}.1f}" for value, width in row))
 
 
-def times(part: ParametricPart, recovery: PoseRecovery, repeats: int) -> list[float]:
-    """Milliseconds of every column, and the number of instances found."""
+def processor(device: str) -> str:
+    """What is measured."""
+    if device.startswith("cuda"):
+        return torch.cuda.get_device_name(device)
+    return platform.processor() or platform.machine()
 
-    def clock(run: Callable[[], object]) -> float:
-        return timing(run, repeats).ms
 
-    prediction = predict(part, by_point=not recovery.voting.filters_keypoints)
-    centroids, keypoints = prediction.centroid[0].double(), prediction.keypoints[0].double()
-    labels = recovery.cluster(centroids)
-    reliable = recovery._reliable(centroids, keypoints, labels)
-    votes = PointVotes(centroids, keypoints, labels, int(labels.max()) + 1, reliable)
+def times(
+    part: ParametricPart, recovery: PoseRecovery, prediction: PointPrediction, repeats: int
+) -> list[float]:
+    """Milliseconds a scene of every column, and the number of instances found in the first."""
+    scenes = len(prediction.centroid)
+
+    def finished(run: Callable[[], object]) -> Callable[[], None]:
+        def wait() -> None:
+            run()
+            if prediction.centroid.device.type == "cuda":
+                torch.cuda.synchronize()
+
+        return wait
+
+    def clock(run: Callable[[], object], most: int = repeats) -> float:
+        return timing(finished(run), most).ms / scenes
+
+    centroids = prediction.centroid
+    clusters = clusters_of(recovery.cluster(centroids))
+    votes = recovery._votes(prediction, clusters)
     agreed = recovery.voting(part, votes)
     target = agreed.parameters, agreed.centroid, agreed.keypoints
     return [
         clock(lambda: recovery.cluster(centroids)),
-        timing(lambda: scikit_clusters(recovery.cluster, centroids), 1).ms,
-        clock(lambda: recovery._reliable(centroids, keypoints, labels)),
+        clock(lambda: [scikit_clusters(recovery.cluster, scene) for scene in centroids.cpu().double()], 1),
+        clock(lambda: recovery._votes(prediction, clusters)),
         clock(lambda: recovery.voting(part, votes)),
         clock(lambda: fit_pose(part.chain, *target)),
         clock(
             lambda: [fit_pose(part.chain, *one) for one in zip(*(t.split(1) for t in target), strict=True)]
         ),
-        clock(lambda: recovery(part, prediction, 0)),
-        len(recovery(part, prediction, 0).score),
+        clock(lambda: recovery(part, prediction)),
+        len(recovery(part, prediction)[0].score),
     ]
+
+
+def predictions(part: ParametricPart, by_point: bool, scenes: int, device: torch.device) -> PointPrediction:
+    """Of so many different scenes."""
+    each = [vars(predict(part, by_point, seed)).values() for seed in range(scenes)]
+    return PointPrediction(*(torch.cat(values).to(device) for values in zip(*each, strict=True)))
 
 
 def predict(part: ParametricPart, by_point: bool, seed: int = 0) -> PointPrediction:

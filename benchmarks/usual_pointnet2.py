@@ -19,7 +19,7 @@ def pairwise_square(a: Tensor, b: Tensor) -> Tensor:
 def ball_query(points: Tensor, centres: Tensor, radius: float, k: int) -> Tensor:
     """(B, M, k) the first k points within the radius; short rows are filled with their first."""
     n = points.shape[1]
-    index = torch.arange(n).repeat(*centres.shape[:2], 1)
+    index = torch.arange(n, device=points.device).repeat(*centres.shape[:2], 1)
     index[pairwise_square(centres, points) > radius**2] = n
     index = index.sort(-1)[0][:, :, :k]
     first = index[:, :, :1].expand_as(index)
@@ -36,10 +36,10 @@ def three_nearest(points: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
 def farthest_points(points: Tensor, count: int) -> Tensor:
     """(B, count) indices: one pass over all points per choice."""
     batch, n, _ = points.shape
-    cloud = torch.arange(batch)
-    order = torch.zeros(batch, count, dtype=torch.long)
-    gap = torch.full((batch, n), 1e10)
-    last = torch.zeros(batch, dtype=torch.long)
+    cloud = torch.arange(batch, device=points.device)
+    order = torch.zeros(batch, count, dtype=torch.long, device=points.device)
+    gap = torch.full((batch, n), 1e10, device=points.device)
+    last = torch.zeros(batch, dtype=torch.long, device=points.device)
     for i in range(count):
         order[:, i] = last
         square = (points - points[cloud, last][:, None]).square().sum(-1)
@@ -50,7 +50,7 @@ def farthest_points(points: Tensor, count: int) -> Tensor:
 
 def take(rows: Tensor, index: Tensor) -> Tensor:
     """(B, n, C), (B, ...) → (B, ..., C)."""
-    cloud = torch.arange(len(rows)).view(-1, *[1] * (index.ndim - 1)).expand_as(index)
+    cloud = torch.arange(len(rows), device=rows.device).view(-1, *[1] * (index.ndim - 1)).expand_as(index)
     return rows[cloud, index]
 
 

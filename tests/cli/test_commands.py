@@ -202,7 +202,7 @@ BAD_TRAINING = [
     (("data.root=nowhere",), "nowhere"),
     (("part=tn06", "data.root=outputs/data/tn34_smoke"), "shows tn34, not tn06; set part=tn34"),
     (("part.learning.r=[-1]",), "parameters must be positive"),
-    (("trainer.precision=16",), "choose 32, bf16 or auto"),
+    (("trainer.precision=16",), "choose 32, tf32, bf16 or auto"),
     (("trainer.validate_every=3",), "must be a multiple of trainer.checkpoint_every"),
     (("trainer.steps=5",), "must be a multiple of trainer.checkpoint_every"),
     (("loss.norm=cubic",), "cubic"),

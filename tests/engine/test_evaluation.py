@@ -11,6 +11,7 @@ from pnet.data.poseutils import write_poseutils
 from pnet.engine.evaluation import SceneScorer, predict_scenes
 from pnet.engine.method import NetworkMethod, Timing
 from pnet.metrics.sileane_results import score_folder
+from pnet.postprocess.detections import no_detections
 from pnet.records import Detections, Scene
 
 
@@ -141,6 +142,23 @@ def test_the_estimator_counts_its_time_and_leaves_the_network_as_it_was(estimato
     assert estimator.network.training and estimator.timing.scenes == 2
     assert estimator.timing.network > 0 and estimator.timing.postprocess > 0
     assert all(torch.equal(value, before[name]) for name, value in estimator.network.state_dict().items())
+
+
+def test_the_recovery_is_told_what_the_network_says_of_its_clouds(estimator, make_scene, tn34):
+    """On the CPU a scene at a time; the network alone says the same of each."""
+    clouds = torch.stack([torch.from_numpy(make_scene(tn34, seed=seed).points) for seed in range(2)])
+    given = []
+
+    def note(part, prediction, points):
+        given.append((prediction, points))
+        return [no_detections(part, len(cloud)) for cloud in points]
+
+    estimator.recovery = note
+    assert [len(found.instance) for found in estimator.estimate(clouds)] == [400, 400]
+    assert torch.equal(torch.cat([points for _, points in given]), clouds)
+    with torch.no_grad():
+        said = estimator.network.eval()(clouds[1:])
+    assert torch.equal(given[1][0].keypoints, said.keypoints) and len(given) == 2
 
 
 def test_an_empty_cloud_holds_nothing(estimator):

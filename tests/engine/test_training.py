@@ -15,6 +15,7 @@ from pnet.data.source import StoredData
 from pnet.engine.callbacks import PoseValidation, Throughput
 from pnet.engine.checkpoints import NAME, ResumableCheckpoint, read_checkpoint
 from pnet.engine.method import NetworkMethod
+from pnet.engine.precision import Precision
 from pnet.engine.schedules import WarmupCosine
 from pnet.engine.training import PoseTraining
 from pnet.models.losses import ParametricLoss
@@ -67,13 +68,15 @@ def fit(
     identity="one",
     extra=(),
     rule="camera",
+    compiled=False,
 ):
     """Train for nine steps of two scenes; a checkpoint every three."""
     lightning.seed_everything(seed, verbose=False)
     network = ParametricNet(backbone(), 3, [8], [8], 0.02, True)
     optimizer = partial(torch.optim.AdamW, lr=0.003)
     schedule, loss = WarmupCosine(0.1, 0.01), ParametricLoss(part, "each")
-    module = PoseTraining(network, loss, optimizer, schedule, False, {"backbone": identity})
+    belongs = {"backbone": identity}
+    module = PoseTraining(network, loss, optimizer, schedule, Precision.FLOAT32, belongs, compiled)
     data = SceneDataModule(
         part, StoredData(root), Targets(rule), Augmentation(True, 1e-4), None, 2, 2 * EPOCH_STEPS, 1, 0, seed
     )
@@ -94,6 +97,20 @@ def fit(
     )
     trainer.fit(module, datamodule=data, ckpt_path=folder / NAME if resume else None, weights_only=True)
     return SimpleNamespace(weights=network.state_dict(), trainer=trainer, data=data)
+
+
+@pytest.mark.parametrize("backbone", [pointnet2, range_unet])
+def test_a_compiled_network_is_trained_to_the_same_weights(root, tn34, tmp_path, backbone, monkeypatch):
+    """Without the code generator, which needs a C++ compiler: what it is given is one whole graph."""
+    whole = partial(torch.compile, backend="aot_eager", fullgraph=True)
+    plain = fit(root, tn34, tmp_path / "plain", backbone)
+    monkeypatch.setattr(torch, "compile", whole)
+    compiled = fit(root, tn34, tmp_path / "compiled", backbone, compiled=True)
+    assert compiled.weights.keys() == plain.weights.keys()
+    for name, value in plain.weights.items():
+        torch.testing.assert_close(compiled.weights[name], value, rtol=1e-4, atol=1e-6)
+    names = (read_checkpoint(tmp_path / run / NAME)["state_dict"].keys() for run in ("plain", "compiled"))
+    assert next(names) == next(names)
 
 
 def equal(one: dict, other: dict) -> bool:

@@ -1,6 +1,7 @@
 """Gathering and its reverse against loops over rows; gradients against finite differences."""
 
 import math
+import re
 from contextlib import nullcontext
 
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.autograd import gradcheck, gradgradcheck
 
-from pnet.ops.gathering import gather_max, gather_rows, gather_sum
+from pnet.ops.gathering import gather_max, gather_rows, gather_sum, scatter_sum
 from pnet.ops.operators import OPERATORS, plain_operators
 
 DIGITS = {torch.float32: 1e-6, torch.float64: 1e-12}
@@ -115,8 +116,8 @@ def test_scattering_adds_up_what_meets_in_a_row():
         assert found.tolist() == [[[1, 10], [0, 0], [5, 50], [0, 0]]]
     for found in both(lambda: OPERATORS["scatter_sum"](rows, index, weight, 4)):
         assert found.tolist() == [[[0.5, 5], [0, 0], [9, 90], [0, 0]]]
-    winner = torch.tensor([[[3, 0], [3, 1]]], dtype=torch.int32)
-    for found in both(lambda: OPERATORS["scatter_max"](rows, winner, 4)):
+    winner, index = torch.tensor([[[3, 0], [3, 1]]], dtype=torch.int32), torch.tensor([[[0, 3], [1, 3]]])
+    for found in both(lambda: OPERATORS["scatter_max"](rows, winner, index, 4)):
         assert found.tolist() == [[[0, 10], [0, 20], [0, 0], [3, 0]]]
 
 
@@ -264,16 +265,33 @@ def test_a_table_of_another_cloud_is_refused(gather, bad):
 @pytest.mark.parametrize("shape", [(2, 3, 1), (1, 3, 0)])
 @pytest.mark.parametrize("gather", [gather_sum, gather_max])
 def test_a_table_of_another_shape_is_refused(gather, shape):
-    with pytest.raises(ValueError, match="does not fit 1 clouds of 4 rows"):
+    with pytest.raises(
+        ValueError, match=rf"a table of shape {re.escape(str(shape))} does not fit rows \(1, 4, 2\)"
+    ):
         gather(torch.rand(1, 4, 2), torch.zeros(shape, dtype=torch.int64))
+
+
+def test_a_table_of_more_rows_than_are_sent_is_refused():
+    table = torch.zeros(1, 5, 1, dtype=torch.int64)
+    with pytest.raises(ValueError, match=r"a table of shape \(1, 5, 1\) does not fit rows \(1, 4, 2\)"):
+        scatter_sum(torch.rand(1, 4, 2), table, 3)
+
+
+def test_weights_of_another_table_are_refused():
+    table, message = torch.zeros(1, 5, 2, dtype=torch.int64), r"weights \(1, 5, 1\) do not fit .* \(1, 5, 2\)"
+    with pytest.raises(ValueError, match=message):
+        gather_sum(torch.rand(1, 4, 2), table, torch.rand(1, 5, 1))
+    with pytest.raises(ValueError, match=message):
+        scatter_sum(torch.rand(1, 5, 2), table, 4, torch.rand(1, 5, 1))
 
 
 @pytest.mark.parametrize("winner", [4, -1])
 def test_nothing_is_written_outside(winner):
+    table = torch.full((1, 1, 1), winner)
     with pytest.raises(IndexError, match="into 4 rows"):
-        OPERATORS["scatter_max"](torch.ones(1, 1, 1), torch.full((1, 1, 1), winner, dtype=torch.int32), 4)
+        OPERATORS["scatter_max"](torch.ones(1, 1, 1), table.int(), table, 4)
     with pytest.raises(IndexError, match="into 4 rows"):
-        OPERATORS["scatter_sum"](torch.ones(1, 1, 1), torch.full((1, 1, 1), winner), None, 4)
+        OPERATORS["scatter_sum"](torch.ones(1, 1, 1), table, None, 4)
 
 
 @pytest.mark.parametrize("plain", [False, True])
@@ -286,4 +304,4 @@ def test_short_numbers_are_added_up_in_float32(plain):
         spread = OPERATORS["scatter_sum"](rows, index, None, 2)
         # one by one in bfloat16 the sum would stop at 256
         assert spread.flatten().tolist() == [400, 0] and spread.dtype == torch.bfloat16
-        assert OPERATORS["scatter_max"](rows, index.int(), 2).flatten().tolist() == [400, 0]
+        assert OPERATORS["scatter_max"](rows, index.int(), index, 2).flatten().tolist() == [400, 0]

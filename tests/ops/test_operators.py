@@ -10,6 +10,7 @@ import torch
 
 from pnet.ops import neighbours, sampling
 from pnet.ops.gathering import gather_max, gather_rows, gather_sum
+from pnet.ops.grouping import group_max
 from pnet.ops.neighbours import ball_query, nearest, octants, three_nearest
 from pnet.ops.operators import OPERATORS, check_clouds, plain_operators, squared, squared_distance
 from pnet.ops.sampling import farthest_points
@@ -20,6 +21,8 @@ INDEX = torch.randint(0, 9, (2, 7, 4), generator=torch.Generator().manual_seed(2
 WEIGHT = torch.rand(2, 7, 4, generator=torch.Generator().manual_seed(3))
 SPREAD = ROWS[:, :7]
 WINNER = INDEX[..., :1].expand(2, 7, 5).int().contiguous()
+GROUPS = torch.rand(2, 7, 4, 5, generator=torch.Generator().manual_seed(4)) - 0.5
+PLACE = GROUPS.argmax(2).int()
 
 
 def learned(rows: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
@@ -42,7 +45,10 @@ def inputs(dtype: torch.dtype) -> list[tuple[str, tuple]]:
         ("scatter_sum", (learned(SPREAD, dtype), INDEX, weight, 9)),
         ("gather_max", (learned(ROWS, dtype), INDEX)),
         ("gather_max", (ROWS.to(dtype), INDEX)),
-        ("scatter_max", (SPREAD.to(dtype), WINNER, 9)),
+        ("scatter_max", (SPREAD.to(dtype), WINNER, INDEX, 9)),
+        ("group_max", (learned(GROUPS, dtype),)),
+        ("group_max", (GROUPS.to(dtype),)),
+        ("ungroup_max", (SPREAD.to(dtype), PLACE, 4)),
     ]
 
 
@@ -217,6 +223,8 @@ def test_how_a_tensor_lies_in_memory_does_not_matter(stride, dtype):
         lambda p, r, i, w: OPERATORS["scatter_sum"](
             r[:, : i.shape[1]], i[:, : r.shape[1]], w[:, : r.shape[1]], 9
         ),
+        lambda p, r, i, w: group_max(r[:, :, None].expand(-1, -1, 3, -1)),
+        lambda p, r, i, w: OPERATORS["ungroup_max"](r, r.argmax(2, keepdim=True).expand(r.shape).int(), 4),
     ]
     for call in calls:
         given, plain = (points, rows, index, weight), [t.contiguous() for t in (points, rows, index, weight)]
@@ -232,6 +240,7 @@ def everything(points: torch.Tensor, rows: torch.Tensor, index: torch.Tensor, we
         lambda r: gather_sum(r, index),
         lambda r: gather_sum(r, index, weight),
         lambda r: gather_max(r, index),
+        lambda r: group_max(r.unflatten(1, (100, 7))),
     ):
         given = rows.clone().requires_grad_()
         taken = gather(given)

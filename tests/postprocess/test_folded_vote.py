@@ -1,6 +1,7 @@
 """Voting modulo the symmetry: exact for exact votes, robust, and blind to which equivalent was meant."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,15 +14,15 @@ from pnet.geometry.symmetry import SphericalSymmetry, rotation_about_z
 from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointChoice, KeypointRule, NearestToPoint
 from pnet.postprocess.fit import fit_pose
-from pnet.postprocess.folded_vote import FLOOR, ROUNDS, FoldedVote, _locate, fold, location, members
-from pnet.postprocess.locations import locate
+from pnet.postprocess.folded_vote import FoldedVote, fold
+from pnet.postprocess.grouping import clusters_of
 from pnet.postprocess.vote import InstanceVotes, MeanVote, PointVotes
 
 FOLDED = FoldedVote(hypotheses=96, votes=512, width=25.0, cut=3.0)
 
 
 def surface_votes(part: ParametricPart, sizes, R, t, counts) -> PointVotes:
-    """Exact votes of surface points under the rule `point`, clusters mixed, some points in none."""
+    """Exact votes of surface points under the rule `point`, in a random order within a cluster."""
     centroid, keypoints, owner = [], [], []
     for i, count in enumerate(counts):
         surface = torch.from_numpy(part.mesh(sizes[i].numpy()).sample(count, seed=i)).double()
@@ -29,13 +30,15 @@ def surface_votes(part: ParametricPart, sizes, R, t, counts) -> PointVotes:
         keypoints.append(apply_pose(R[i], t[i], part.chain.choose(NearestToPoint(surface), template)[0]))
         centroid.append(t[i].expand(count, 3))
         owner += [i] * count
-    stray = 5
-    centroid.append(torch.full((stray, 3), 9.0).double())
-    keypoints.append(torch.full((stray, len(part.chain), 3), 9.0).double())
-    order = torch.randperm(len(owner) + stray, generator=torch.Generator().manual_seed(0))
-    label = torch.tensor(owner + [-1] * stray)[order]
-    reliable = (label >= 0)[:, None].expand(-1, 1 + len(part.chain))
-    return PointVotes(torch.cat(centroid)[order], torch.cat(keypoints)[order], label, len(counts), reliable)
+    order = torch.randperm(len(owner), generator=torch.Generator().manual_seed(0))
+    return point_votes(torch.cat(centroid)[order], torch.cat(keypoints)[order], torch.tensor(owner)[order])
+
+
+def point_votes(centroid, keypoints, owner) -> PointVotes:
+    """All votes of points (n, ...) in any order."""
+    clusters = clusters_of(owner[None])
+    reliable = torch.ones(len(owner), 1 + keypoints.shape[1], dtype=torch.bool)
+    return PointVotes(clusters.of(centroid[None]), clusters.of(keypoints[None]), clusters.groups, reliable)
 
 
 def recovered(part, agreed: InstanceVotes) -> torch.Tensor:
@@ -74,8 +77,7 @@ def test_other_rules_fold_as_well(any_part, random_poses, random_sizes, error_mo
     sizes = random_sizes(any_part, 30)
     keypoints = apply_pose(R, t, any_part.chain.select(KeypointChoice(rule), sizes, R)[0])
     owner = torch.arange(30).repeat_interleave(3)
-    reliable = torch.ones(90, 1 + len(any_part.chain), dtype=torch.bool)
-    agreed = FOLDED(any_part, PointVotes(t[owner], keypoints[owner], owner, 30, reliable))
+    agreed = FOLDED(any_part, point_votes(t[owner], keypoints[owner], owner))
     assert error_modulo(any_part.symmetry, recovered(any_part, agreed), R) < 1e-6
     torch.testing.assert_close(agreed.parameters, sizes, rtol=0, atol=1e-9)
 
@@ -87,10 +89,10 @@ def test_thirty_percent_of_wild_votes_hardly_matter(any_part, random_poses, rand
     sizes = random_sizes(any_part, 5, seed)
     votes = surface_votes(any_part, sizes, R, t, (200,) * 5)
     generator = torch.Generator().manual_seed(seed)
-    wild = torch.rand(len(votes.owner), 1, 1, generator=generator, dtype=torch.float64) < 0.3
+    wild = torch.rand(len(votes.centroid), 1, 1, generator=generator, dtype=torch.float64) < 0.3
     noise = torch.randn(votes.keypoints.shape, generator=generator, dtype=torch.float64)
     noisy = votes.keypoints + noise * torch.where(wild, 0.03, 0.0005)
-    agreed = FOLDED(any_part, PointVotes(votes.centroid, noisy, votes.owner, 5, votes.reliable))
+    agreed = FOLDED(any_part, replace(votes, keypoints=noisy))
     assert math.degrees(error_modulo(any_part.symmetry, recovered(any_part, agreed), R)) < 2.5
     assert float((agreed.parameters - sizes).abs().max()) < 0.0003
 
@@ -149,13 +151,13 @@ def test_unreliable_centroid_votes_do_not_count(tn34, random_poses, random_sizes
     R, t = random_poses(1)
     sizes = random_sizes(tn34, 1)
     votes = surface_votes(tn34, sizes, R, t, (100,))
-    off = torch.arange(len(votes.owner)) % 4 == 0
+    off = torch.arange(len(votes.centroid)) % 4 == 0
     moved = votes.centroid + 0.004 * off[:, None]
     reliable = votes.reliable.clone()
     reliable[off, 0] = False
-    counted = FOLDED(tn34, PointVotes(moved, votes.keypoints, votes.owner, 1, reliable))
+    counted = FOLDED(tn34, replace(votes, centroid=moved, reliable=reliable))
     torch.testing.assert_close(counted.centroid, t, rtol=0, atol=1e-12)
-    plain = FOLDED(tn34, PointVotes(moved, votes.keypoints, votes.owner, 1, votes.reliable))
+    plain = FOLDED(tn34, replace(votes, centroid=moved))
     assert float((plain.centroid - t).norm()) > 0.001
 
 
@@ -165,89 +167,18 @@ def test_only_the_first_so_many_votes_are_used(tn06, random_poses, random_sizes,
     votes = surface_votes(tn06, sizes, R, t, (80, 90))
     spoilt = votes.keypoints.clone()
     for i in range(2):
-        spoilt[torch.nonzero(votes.owner == i).squeeze(1)[20:]] = float("nan")
+        spoilt[torch.nonzero(votes.groups.owner == i).squeeze(1)[20:]] = float("nan")
     few = FoldedVote(hypotheses=12, votes=20, width=25.0, cut=3.0)
-    agreed = few(tn06, PointVotes(votes.centroid, spoilt, votes.owner, 2, votes.reliable))
+    agreed = few(tn06, replace(votes, keypoints=spoilt))
     assert error_modulo(tn06.symmetry, recovered(tn06, agreed), R) < 1e-6
     torch.testing.assert_close(agreed.parameters, sizes, rtol=0, atol=1e-9)
-
-
-def test_members_by_hand():
-    index, valid = members(torch.tensor([1, -1, 0, 1, 1, 2, -1, 1, 0]), 3, 3)
-    assert index.tolist() == [[2, 8, 2], [0, 3, 4], [5, 5, 5]]
-    assert valid.tolist() == [[True, True, False], [True] * 3, [True, False, False]]
-    assert members(torch.tensor([1, 0, 1]), 2, 1)[0].tolist() == [[1], [0]]
-    assert members(torch.tensor([0, 0]), 1, 50)[0].tolist() == [[0, 1]]  # no wider than the largest
-
-
-@settings(max_examples=30, deadline=None)
-@given(seed=st.integers(0, 10**6), d=st.integers(1, 5), most=st.integers(1, 12))
-def test_members_against_one_cluster_at_a_time(seed, d, most):
-    generator = torch.Generator().manual_seed(seed)
-    owner = torch.cat([torch.arange(d), torch.randint(-1, d, (30,), generator=generator)])
-    index, valid = members(owner, d, most)
-    for c in range(d):
-        own = torch.nonzero(owner == c).squeeze(1)[:most].tolist()
-        assert index[c, valid[c]].tolist() == own
-        assert set(index[c, ~valid[c]].tolist()) <= {own[0]}
-
-
-def test_the_location_by_hand():
-    """Median 0.01, distances 0.01, 0, 0.01; with cut 2 the weights at 1/2 are 9/16; the far one has none."""
-    values = torch.tensor([[[0.0], [0.01], [0.02], [5.0]]], dtype=torch.float64)
-    centre, spread = location(values, torch.ones(1, 4, dtype=torch.bool), 2.0)
-    assert float(centre) == pytest.approx(0.01)
-    assert float(spread) == pytest.approx(0.01 * math.sqrt(2 * 9 / 16 / (1 + 2 * 9 / 16)))
-
-
-def test_the_location_leaves_invalid_entries_out():
-    values = torch.tensor([[[1.0, 2.0]] * 3 + [[7.0, 7.0]] * 5, [[3.0, 4.0]] * 8], dtype=torch.float64)
-    valid = torch.tensor([[True] * 3 + [False] * 5, [True] * 8])
-    centre, spread = location(values, valid, 3.0)
-    assert centre.tolist() == [[1, 2], [3, 4]] and spread.tolist() == [0, 0]
-
-
-@pytest.mark.parametrize("wild", [0, 10, 45])
-def test_the_location_of_a_cloud_is_its_middle_whatever_lies_far_off(wild):
-    generator = torch.Generator().manual_seed(0)
-    values = torch.randn(1, 100, 3, generator=generator, dtype=torch.float64)
-    values[:, :wild] += 1000
-    centre, spread = location(values, torch.ones(1, 100, dtype=torch.bool), 3.0)
-    assert float(centre.norm()) < 0.4
-    assert 1 < float(spread) < 2  # √3 for the whole cloud
-
-
-def test_scattered_votes_keep_their_median():
-    """Two votes, each a median distance or more from the middle of a cut below one: neither counts."""
-    values = torch.tensor([[[0.0, 1.0], [1.0, 0.0]]], dtype=torch.float64)
-    centre, _ = location(values, torch.ones(1, 2, dtype=torch.bool), 0.5)
-    assert centre.tolist() == [[0, 0]]
-
-
-@settings(max_examples=20, deadline=None)
-@given(
-    seed=st.integers(0, 10**6),
-    n=st.integers(1, 60),
-    c=st.integers(1, 4),
-    cut=st.sampled_from([0.5, 1.5, 3.0]),
-)
-def test_the_compiled_location_is_the_plain_one(seed, n, c, cut):
-    generator = torch.Generator().manual_seed(seed)
-    values = torch.randn(5, n, c, generator=generator, dtype=torch.float64)
-    values[:, ::4] *= 20
-    values[1] = values[1, :1]  # all equal
-    valid = torch.rand(5, n, generator=generator) < 0.8
-    valid[:, 0] = True
-    found, expected = (run(values, valid, cut, FLOOR, ROUNDS) for run in (locate, _locate))
-    torch.testing.assert_close(found[0], expected[0], rtol=0, atol=1e-9)
-    torch.testing.assert_close(found[1], expected[1], rtol=0, atol=1e-9)
 
 
 def test_the_folded_vote_is_the_same_for_any_number_of_threads(tn06, random_poses, random_sizes):
     R, t = random_poses(6)
     votes = surface_votes(tn06, random_sizes(tn06, 6), R, t, (300, 40, 90, 150, 10, 200))
     noise = torch.randn(votes.keypoints.shape, generator=torch.Generator().manual_seed(0)).double()
-    noisy = PointVotes(votes.centroid, votes.keypoints + 0.001 * noise, votes.owner, 6, votes.reliable)
+    noisy = replace(votes, keypoints=votes.keypoints + 0.001 * noise)
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)

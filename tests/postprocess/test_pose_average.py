@@ -47,7 +47,8 @@ def random_elements(symmetry, n: int, rng: np.random.Generator) -> torch.Tensor:
 
 
 def predict(part, scene: Scene, noise: float = 0.0, wild: float = 0.0, seed: int = 0) -> PosePrediction:
-    """A network that knows each point's pose up to a symmetry element of its own; scene 1 of a batch of two.
+    """A network that knows each point's pose up to a symmetry element of its own; scene 1 of a batch, of
+    scene 0 it says no numbers.
 
     Args:
         noise: of the rotation vector, radians. wild: share of points that say any rotation.
@@ -63,11 +64,12 @@ def predict(part, scene: Scene, noise: float = 0.0, wild: float = 0.0, seed: int
         R,
     )
     t, seen = torch.from_numpy(scene.t)[scene.instance], torch.from_numpy(scene.visibility)[scene.instance]
-    return PosePrediction(*(torch.stack([torch.zeros_like(value), value]) for value in (t, R, seen)))
+    return PosePrediction(*(torch.stack([torch.full_like(value, math.nan), value]) for value in (t, R, seen)))
 
 
 def recover(part, prediction: PosePrediction, points=None, **changes) -> Detections:
-    return replace(AVERAGING, **changes)(part, prediction, 1, points)
+    clouds = None if points is None else torch.stack([torch.zeros_like(points), points])
+    return replace(AVERAGING, **changes)(part, prediction, clouds)[1]
 
 
 def matched(scene: Scene, found: Detections) -> torch.Tensor:
@@ -127,15 +129,14 @@ def test_float32_predictions_make_float64_detections(part, make_scene):
     assert float(torch.linalg.det(found.R).min()) > 0
 
 
-def test_it_reads_the_scene_that_is_asked_for(make_scene):
+def test_every_scene_of_a_batch_has_its_own_instances(make_scene):
     part = load_part("tn34")
     scenes = [make_scene(part, bodies=n, points=300, seed=n) for n in (2, 3)]
     each = [predict(part, scene) for scene in scenes]
     both = PosePrediction(
         *(torch.stack([getattr(p, name)[1] for p in each]) for name in ("centroid", "rotation", "visibility"))
     )
-    for i, scene in enumerate(scenes):
-        found = AVERAGING(part, both, i)
+    for i, (scene, found) in enumerate(zip(scenes, AVERAGING(part, both), strict=True)):
         assert len(found.score) == i + 2 and float(angles(part, scene, found).max()) < 1e-6
 
 
@@ -338,7 +339,7 @@ def test_refinement_has_the_last_word_on_the_pose(make_scene, shift):
 def test_refinement_without_points_is_refused(make_scene, shift):
     part = load_part("gear")
     prediction = predict(part, make_scene(part, bodies=1, points=300))
-    with pytest.raises(ValueError, match=r"postprocess\.refine needs the scene's points"):
+    with pytest.raises(ValueError, match=r"postprocess\.refine needs the scenes' points"):
         recover(part, prediction, refine=shift)
     assert shift.given == []
 

@@ -8,9 +8,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
+from pnet.postprocess.grouping import clusters_of
+from pnet.postprocess.kernels import Kernels, only
 from pnet.postprocess.radius_filter import RadiusFilter
 
+BOTH = pytest.mark.parametrize("kernels", [Kernels.NUMBA, Kernels.PLAIN])
 RF = RadiusFilter(radius=0.01, neighbours=3, widen=0.002, max_radius=0.02, enough=0.1)
+
+
+def filtered(rf: RadiusFilter, votes: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+    """(N,) bool of votes (N, 3) in any order, labels (N,); no number may be left out."""
+    clusters = clusters_of(labels[None])
+    kept = torch.zeros(len(labels), dtype=torch.bool)
+    kept[clusters.member] = rf(clusters.of(votes[None])[:, None], clusters.groups)[:, 0]
+    return kept
 
 
 def naive(rf: RadiusFilter, votes: torch.Tensor, labels: torch.Tensor) -> list[bool]:
@@ -33,7 +44,8 @@ def naive(rf: RadiusFilter, votes: torch.Tensor, labels: torch.Tensor) -> list[b
     return kept
 
 
-@settings(max_examples=60, deadline=None)
+@BOTH
+@settings(max_examples=40, deadline=None)
 @given(
     seed=st.integers(0, 10**6),
     n=st.integers(1, 40),
@@ -41,12 +53,13 @@ def naive(rf: RadiusFilter, votes: torch.Tensor, labels: torch.Tensor) -> list[b
     neighbours=st.integers(0, 6),
     enough=st.sampled_from([0.1, 0.4, 0.9]),
 )
-def test_it_is_the_naive_loop_and_never_loses_a_cluster(seed, n, d, neighbours, enough):
+def test_it_is_the_naive_loop_and_never_loses_a_cluster(kernels, seed, n, d, neighbours, enough):
     generator = torch.Generator().manual_seed(seed)
     votes = 0.03 * torch.rand(n, 3, generator=generator, dtype=torch.float64)
-    labels = torch.randint(-1, d, (n,), generator=generator)
+    labels = torch.cat([torch.arange(d), torch.randint(-1, d, (n,), generator=generator)])[:n]
     rf = replace(RF, neighbours=neighbours, enough=enough)
-    kept = rf(votes, labels)
+    with only(kernels):
+        kept = filtered(rf, votes, labels)
     assert kept.tolist() == naive(rf, votes, labels)
     assert set(labels[kept].tolist()) == set(labels.tolist()) - {-1}
 
@@ -73,10 +86,9 @@ def by_trees(rf: RadiusFilter, votes: torch.Tensor, labels: torch.Tensor) -> tor
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("neighbours", [20, 120])
 def test_a_full_scene_is_filtered_as_by_one_tree_a_cluster(neighbours, dtype, monkeypatch):
-    """Tight, wide and scattered clusters of 20 to 400 votes, one number unused; any number of threads."""
+    """Tight, wide and scattered clusters of 20 to 400 votes; any number of threads, or plain torch."""
     generator = torch.Generator().manual_seed(0)
     labels = torch.repeat_interleave(torch.arange(-1, 24), 20 + 15 * torch.arange(25))
-    labels[labels == 7] = -1
     labels = labels[torch.randperm(len(labels), generator=generator)]
     spread = torch.tensor([0.0007, 0.006, 0.012, 0.05])[labels % 4]
     votes = spread[:, None] * torch.randn(len(labels), 3, generator=generator)
@@ -86,7 +98,21 @@ def test_a_full_scene_is_filtered_as_by_one_tree_a_cluster(neighbours, dtype, mo
     assert 0.2 < float(expected.double().mean()) < 0.95
     for threads in (1, 3):
         monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
-        assert torch.equal(rf(votes, labels), expected)
+        assert torch.equal(filtered(rf, votes, labels), expected)
+    with only(Kernels.PLAIN):
+        assert torch.equal(filtered(rf, votes, labels), expected)
+
+
+@BOTH
+def test_every_column_has_its_own_verdict(kernels):
+    """Of the second column's ten votes two are far off; in the third all are."""
+    votes = torch.zeros(20, 3, 3).double()
+    votes[[3, 14], 1] = 1.0
+    votes[:, 2] = torch.arange(20.0).double()[:, None]
+    clusters = clusters_of(torch.arange(2).repeat_interleave(10)[None])
+    with only(kernels):
+        kept = RF(votes, clusters.groups)
+    assert bool(kept[:, [0, 2]].all()) and (~kept[:, 1]).nonzero().flatten().tolist() == [3, 14]
 
 
 def row(*x: float) -> torch.Tensor:
@@ -95,44 +121,55 @@ def row(*x: float) -> torch.Tensor:
 
 def test_a_vote_that_stands_alone_is_not_counted():
     votes = row(0, 0.001, 0.002, 0.003, 0.1)
-    assert RF(votes, torch.zeros(5).long()).tolist() == [True] * 4 + [False]
+    assert filtered(RF, votes, torch.zeros(5).long()).tolist() == [True] * 4 + [False]
 
 
 def test_votes_of_another_cluster_do_not_help():
     votes = row(0, 0.001, 0.002, 0.003, 0.0015)
-    assert RF(votes, torch.tensor([0, 0, 0, 0, 1])).tolist() == [True] * 5  # alone in its cluster: kept
+    assert (
+        filtered(RF, votes, torch.tensor([0, 0, 0, 0, 1])).tolist() == [True] * 5
+    )  # alone in its cluster: kept
     labels = torch.tensor([0, 0, 0, 0, -1])
-    assert RF(votes, labels).tolist() == [True] * 4 + [False]
+    assert filtered(RF, votes, labels).tolist() == [True] * 4 + [False]
 
 
 def test_the_radius_widens_until_enough_are_left():
     votes = row(0, 0.013, 0.026, 0.2)
     rf = replace(RF, neighbours=2)
-    assert rf(votes, torch.zeros(4).long()).tolist() == [False, True, False, False]  # at 14 mm
+    assert filtered(rf, votes, torch.zeros(4).long()).tolist() == [False, True, False, False]  # at 14 mm
     narrow = replace(rf, max_radius=0.012)
-    assert narrow(votes, torch.zeros(4).long()).tolist() == [True] * 4  # nothing is dense: all count
+    assert (
+        filtered(narrow, votes, torch.zeros(4).long()).tolist() == [True] * 4
+    )  # nothing is dense: all count
     # without widening there is one pass
-    assert replace(rf, widen=0.0)(votes, torch.zeros(4).long()).tolist() == [True] * 4
+    assert filtered(replace(rf, widen=0.0), votes, torch.zeros(4).long()).tolist() == [True] * 4
 
 
 def test_the_largest_radius_is_tried_too():
     """0.01 + 5 · 0.002 exceeds 0.02 by a rounding error."""
     votes = row(0, 0.019, 0.038, 0.2)
-    assert replace(RF, neighbours=2)(votes, torch.zeros(4).long()).tolist() == [False, True, False, False]
+    assert filtered(replace(RF, neighbours=2), votes, torch.zeros(4).long()).tolist() == [
+        False,
+        True,
+        False,
+        False,
+    ]
 
 
 def test_exactly_enough_is_enough():
     votes = row(*[0.0] * 9, 0.015)  # nine of ten; at 16 mm the tenth would be kept as well
-    kept = replace(RF, enough=0.9)(votes, torch.zeros(10).long())
+    kept = filtered(replace(RF, enough=0.9), votes, torch.zeros(10).long())
     assert kept.tolist() == [True] * 9 + [False]
 
 
 def test_clusters_without_neighbours_at_all_keep_their_votes():
     votes = row(0, 1, 2)
-    assert RF(votes, torch.zeros(3).long()).all()
+    assert filtered(RF, votes, torch.zeros(3).long()).all()
 
 
+@BOTH
 @pytest.mark.parametrize("labels", [[], [-1, -1]])
-def test_without_clusters_nothing_is_kept(labels):
-    kept = RF(torch.zeros(len(labels), 3), torch.tensor(labels).long())
+def test_without_clusters_nothing_is_kept(kernels, labels):
+    with only(kernels):
+        kept = filtered(RF, torch.zeros(len(labels), 3), torch.tensor(labels).long())
     assert kept.tolist() == [False] * len(labels)

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from pnet.ops.gathering import gather_max, gather_rows, gather_sum
+from pnet.ops.grouping import group_max
 from pnet.ops.pyramid import Tables
 
 
@@ -147,11 +148,7 @@ class SetAbstraction(nn.Module):
                 own = features if features is None else self.before[s](features)
                 scales.append(relative.largest(points, own, index))
             else:
-                rows = self.after[s](relative(points, features, index))
-                # neighbours stand in a row already: the table of the maximum is a plain count
-                count = torch.arange(rows.shape[1] * rows.shape[2], device=rows.device)
-                table = count.view(1, *rows.shape[1:3]).expand(len(rows), -1, -1)
-                scales.append(gather_max(rows.flatten(1, 2), table))
+                scales.append(group_max(self.after[s](relative(points, features, index))))
         return torch.cat(scales, -1)
 
 

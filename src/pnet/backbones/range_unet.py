@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from pnet.backbones.base import Backbone
 from pnet.backbones.layers import conv_block, shared_mlp
-from pnet.ops.gathering import gather_rows
+from pnet.ops.gathering import gather_rows, scatter_sum
 from pnet.ops.pyramid import Tables
 
 MAX_CELLS = 1024  # a side; points farther out share the cells of the border
@@ -115,8 +115,7 @@ class RangeUNet(Backbone):
 def _rasterise(cell: Tensor, local: Tensor, rows: int, columns: int) -> Tensor:
     """(B, 4, rows, columns): mean of the points in each cell and whether there are any."""
     content = F.pad(local, (0, 1), value=1.0)
-    total = content.new_zeros(len(cell), rows * columns, CELL_FEATURES)
-    total.scatter_add_(1, cell[..., None].expand_as(content), content)
+    total = scatter_sum(content, cell[..., None], rows * columns)
     count = total[..., -1:]
     mean = total / count.clamp(min=1)
     image = mean.mT.unflatten(2, (rows, columns))

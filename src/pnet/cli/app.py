@@ -6,7 +6,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
@@ -163,15 +163,19 @@ def _guarded(task: Task) -> Task:
     return guarded
 
 
-def chosen_operators(choice: str | None) -> AbstractContextManager[None]:
+def chosen_operators(choice: str | None) -> AbstractContextManager[object]:
     """The setting `ops`: compiled kernels, or the plain torch references in their place."""
     if choice not in (None, "kernels", "reference"):
         raise ValueError(f"ops is {choice!r}, choose kernels or reference")
     if choice != "reference":
         return nullcontext()
     from pnet.ops.operators import plain_operators  # torch takes seconds to import
+    from pnet.postprocess.kernels import Kernels, only
 
-    return plain_operators()
+    stack = ExitStack()
+    stack.enter_context(plain_operators())
+    stack.enter_context(only(Kernels.PLAIN))
+    return stack
 
 
 def _check_launcher(arguments: list[str]) -> None:

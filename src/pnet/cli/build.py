@@ -151,22 +151,6 @@ def device_of(accelerator: str) -> str:
     return "cuda" if torch.cuda.is_available() and accelerator in ("auto", "gpu", "cuda") else "cpu"
 
 
-def use_bf16(precision: str, accelerator: str) -> bool:
-    """Whether to run the network in bfloat16.
-
-    Args:
-        precision: "32", "bf16" or "auto": bf16 where the device multiplies it in hardware.
-        accelerator: trainer.accelerator.
-    """
-    if precision not in ("32", "bf16", "auto"):
-        raise ValueError(f"trainer.precision is {precision!r}, choose 32, bf16 or auto")
-    if precision != "auto":
-        return precision == "bf16"
-    if device_of(accelerator) == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
-    return bool(torch.cpu._is_avx512_bf16_supported())
-
-
 def load_method(run: Path, recovery: DictConfig, accelerator: str | None = None) -> "Method":
     """The method of a run folder.
 
@@ -211,6 +195,7 @@ def network_method(
         where: the weights come from, for errors. accelerator: where it runs; None: as it was trained.
     """
     from pnet.engine.method import NetworkMethod
+    from pnet.engine.precision import Precision
 
     changed = cfg.copy()
     changed.postprocess = recovery
@@ -225,5 +210,6 @@ def network_method(
     except (ValueError, OmegaConfBaseException) as fault:
         raise ValueError(f"{where}: {fault}") from fault
     accelerator = accelerator or cfg.trainer.accelerator
-    network = parts.network.to(device_of(accelerator)).eval()
-    return NetworkMethod(parts.part, network, parts.recovery, use_bf16(cfg.trainer.precision, accelerator))
+    device = device_of(accelerator)
+    precision = Precision.of(cfg.trainer.precision, device)
+    return NetworkMethod(parts.part, parts.network.to(device).eval(), parts.recovery, precision)

@@ -21,12 +21,13 @@ def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
     import torch
 
     quiet_lightning()
-    from pnet.cli.build import build_data, build_parts, device_of, identity, use_bf16
+    from pnet.cli.build import build_data, build_parts, device_of, identity
     from pnet.cli.instantiate import instantiate
     from pnet.engine.allocator import keep_freed_memory
     from pnet.engine.callbacks import PoseValidation, Throughput
     from pnet.engine.checkpoints import NAME, ResumableCheckpoint, read_checkpoint
     from pnet.engine.method import NetworkMethod
+    from pnet.engine.precision import Precision
     from pnet.engine.provenance import read_json
     from pnet.engine.tensorboard import add_settings
     from pnet.engine.training import PoseTraining, check_identity
@@ -35,11 +36,14 @@ def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
 
     if cfg.trainer.threads is not None:
         torch.set_num_threads(cfg.trainer.threads)
-    if device_of(cfg.trainer.accelerator) == "cpu":
+    device = device_of(cfg.trainer.accelerator)
+    if device == "cpu":
         keep_freed_memory()
     checkpoint = resume_from(cfg.ckpt, run / "checkpoints" / NAME)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
-    parts, bf16 = build_parts(cfg), use_bf16(cfg.trainer.precision, cfg.trainer.accelerator)
+    precision = Precision.of(cfg.trainer.precision, device)
+    precision.set_products(device)
+    parts = build_parts(cfg)
     data = build_data(cfg, parts)
     validation = data.scenes("val", cfg.data.val_every)
     data.train_dataloader()  # says now, before anything is written, what is wrong with the data
@@ -48,12 +52,12 @@ def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
         instantiate(cfg.loss, part=parts.part),
         instantiate(cfg.optimizer),
         instantiate(cfg.schedule),
-        bf16,
+        precision,
         {**identity(cfg), "data": settings_fingerprint(data.source.manifest())},
         compiled(cfg.trainer),
     )
     throughput = Throughput()
-    estimator = NetworkMethod(parts.part, parts.network, parts.recovery, bf16)
+    estimator = NetworkMethod(parts.part, parts.network, parts.recovery, precision)
     callbacks = [
         throughput,
         PoseValidation(estimator, validation, cfg.data.points, cfg.trainer.mesh_every),
@@ -81,6 +85,7 @@ def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
         trainer.validate(module, datamodule=data, verbose=False)
     return {
         **final_metrics(trainer, throughput),
+        "precision": str(precision),
         "recipe": recipe_text(training_settings(cfg)),
         "network": vars(summary),
     }

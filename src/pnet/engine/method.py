@@ -8,8 +8,9 @@ import torch
 from torch import Tensor, nn
 
 from pnet.backbones.base import Backbone
+from pnet.engine.precision import Precision
 from pnet.parts.base import ParametricPart
-from pnet.postprocess.pipeline import no_detections
+from pnet.postprocess.detections import no_detections
 from pnet.records import Detections
 
 
@@ -37,9 +38,9 @@ class Recovery(Protocol):
     """A learned method's post-processing: what its network says of points → instances."""
 
     def __call__(
-        self, part: ParametricPart, prediction: Any, scene: int, points: Tensor | None = None
-    ) -> Detections:
-        """Of one scene of a batch; points: (N, 3) its cloud, camera frame, metres."""
+        self, part: ParametricPart, prediction: Any, points: Tensor | None = None
+    ) -> list[Detections]:
+        """Of every scene of a batch; points: (B, N, 3) their clouds, camera frame, metres."""
         ...
 
 
@@ -54,7 +55,7 @@ class NetworkMethod:
     part: ParametricPart
     network: nn.Module
     recovery: Recovery
-    bf16: bool = False
+    precision: Precision = Precision.FLOAT32
     timing: Timing = field(default_factory=Timing)
 
     @torch.no_grad()
@@ -78,12 +79,12 @@ class NetworkMethod:
 
     def _estimate(self, points: Tensor, device: torch.device) -> list[Detections]:
         start = perf_counter()
-        with torch.autocast(device.type, torch.bfloat16, enabled=self.bf16):
+        with self.precision.numbers(device.type):
             prediction = self.network(points.to(device))
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         middle = perf_counter()
-        found = [self.recovery(self.part, prediction, i, points[i]) for i in range(len(points))]
+        found = self.recovery(self.part, prediction, points)
         self.timing.network += middle - start
         self.timing.postprocess += perf_counter() - middle
         return found

@@ -10,6 +10,7 @@ from torch.nn import Parameter
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
+from pnet.engine.precision import Precision
 from pnet.engine.schedules import Schedule
 from pnet.models.losses import Loss
 from pnet.records import Batch
@@ -24,7 +25,7 @@ class PoseTraining(lightning.LightningModule):
     Args:
         network: points to predictions. loss: predictions and labels to losses.
         optimizer: makes an optimiser of parameters. schedule: learning rate by step.
-        bf16: run the network in bfloat16 autocast.
+        precision: of the network.
         identity: plain values kept in every checkpoint, by which `check_identity` knows its own.
         compiled: let torch.compile make the network's code, for the training steps.
     """
@@ -35,7 +36,7 @@ class PoseTraining(lightning.LightningModule):
         loss: Loss,
         optimizer: Optimization,
         schedule: Schedule,
-        bf16: bool,
+        precision: Precision,
         identity: dict[str, str],
         compiled: bool = False,
     ) -> None:
@@ -45,7 +46,7 @@ class PoseTraining(lightning.LightningModule):
         self._trained: tuple[Predict] = (torch.compile(network) if compiled else network,)
         self.loss = loss
         self._optimizer, self._schedule = optimizer, schedule
-        self._bf16, self.identity = bf16, identity
+        self._precision, self.identity = precision, identity
 
     def training_step(self, batch: Batch, index: int) -> Tensor:
         """Loss of a batch; each module's own is logged."""
@@ -82,7 +83,7 @@ class PoseTraining(lightning.LightningModule):
         check_identity(checkpoint, self.identity)
 
     def _losses(self, network: Predict, batch: Batch) -> dict[str, Tensor]:
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._bf16):
+        with self._precision.numbers(self.device.type):
             predicted = network(batch.points, batch.tables)
         return self.loss(predicted, batch)
 

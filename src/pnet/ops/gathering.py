@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pnet.ops.grouping import first_largest
 from pnet.ops.operators import kernel, operator
 
 
@@ -81,17 +82,13 @@ def _scatter_sum(rows: Tensor, index: Tensor, weight: Tensor | None, n: int) -> 
 @operator
 def _gather_max(rows: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
     """The maximum, and the row (B, M, C) int32 that each channel comes from."""
-    taken = _gathered(rows, index)
-    largest = taken.amax(2)
-    place = torch.arange(index.shape[2], device=index.device)[:, None]
-    wins = (taken == largest[:, :, None]) | taken.isnan()
-    first = torch.where(wins, place, index.shape[2]).amin(2)
+    largest, first = first_largest(_gathered(rows, index))
     return largest, index.gather(2, first).int()
 
 
 @operator
-def _scatter_max(grad: Tensor, winner: Tensor, n: int) -> Tensor:
-    """The reverse of `_gather_max`: (B, M, C) → (B, n, C)."""
+def _scatter_max(grad: Tensor, winner: Tensor, index: Tensor, n: int) -> Tensor:
+    """The reverse of `_gather_max`: (B, M, C) → (B, n, C); winners are in their row of the table."""
     out = grad.new_zeros(len(grad), n, grad.shape[2], dtype=_precise(grad))
     return out.scatter_add(1, winner.long(), grad.to(out)).to(grad)
 
@@ -118,7 +115,7 @@ def _(rows: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @kernel(_scatter_max, "cpu")
-def _(grad: Tensor, winner: Tensor, n: int) -> Tensor:
+def _(grad: Tensor, winner: Tensor, index: Tensor, n: int) -> Tensor:
     from pnet.ops.cpu import gathering as kernels
 
     return kernels.scatter_max(grad, winner, n)
@@ -129,6 +126,27 @@ def _(rows: Tensor, index: Tensor, weight: Tensor | None) -> Tensor:
     from pnet.ops.cuda import gathering as kernels
 
     return kernels.gather_sum(rows, index, weight)
+
+
+@kernel(_scatter_sum, "cuda")
+def _(rows: Tensor, index: Tensor, weight: Tensor | None, n: int) -> Tensor:
+    from pnet.ops.cuda import scattering as kernels
+
+    return kernels.scatter_sum(rows, index, weight, n)
+
+
+@kernel(_gather_max, "cuda")
+def _(rows: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+    from pnet.ops.cuda import gathering as kernels
+
+    return kernels.gather_max(rows, index)
+
+
+@kernel(_scatter_max, "cuda")
+def _(grad: Tensor, winner: Tensor, index: Tensor, n: int) -> Tensor:
+    from pnet.ops.cuda import scattering as kernels
+
+    return kernels.scatter_max(grad, winner, index, n)
 
 
 @_gather_sum.register_fake
@@ -148,7 +166,7 @@ def _(rows: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @_scatter_max.register_fake
-def _(grad: Tensor, winner: Tensor, n: int) -> Tensor:
+def _(grad: Tensor, winner: Tensor, index: Tensor, n: int) -> Tensor:
     return grad.new_empty(grad.shape[0], n, grad.shape[2])
 
 
@@ -173,17 +191,30 @@ def _scatter_backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]
 
 
 def _keep_max(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-    ctx.save_for_backward(output[1])
+    ctx.save_for_backward(output[1], inputs[1])
     ctx.n = inputs[0].shape[1]
 
 
 def _max_backward(ctx: Any, grad: Tensor, _: None) -> tuple[Tensor, None]:
-    return _scatter_max(grad, ctx.saved_tensors[0], ctx.n), None
+    return _scatter_max(grad, *ctx.saved_tensors, ctx.n), None
 
 
 _gather_sum.register_autograd(_sum_backward, setup_context=_keep_sum)
 _scatter_sum.register_autograd(_scatter_backward, setup_context=_keep_scatter)
 _gather_max.register_autograd(_max_backward, setup_context=_keep_max)
+
+
+def check_table(index: Tensor, rows: Tensor, axes: int, weight: Tensor | None = None) -> None:
+    """For kernels, which read where they are told.
+
+    Raises:
+        ValueError: where the table's first `axes` axes are not the rows', it has no neighbours, or the
+            weights are not its own.
+    """
+    if index.shape[:axes] != rows.shape[:axes] or index.shape[2] == 0:
+        raise ValueError(f"a table of shape {tuple(index.shape)} does not fit rows {tuple(rows.shape)}")
+    if weight is not None and weight.shape != index.shape:
+        raise ValueError(f"weights {tuple(weight.shape)} do not fit a table of shape {tuple(index.shape)}")
 
 
 def _gathered(rows: Tensor, index: Tensor) -> Tensor:

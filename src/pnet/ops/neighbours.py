@@ -108,6 +108,27 @@ def _(points: Tensor, limit: float) -> Tensor:
     return kernels.octants(points.contiguous(), limit)
 
 
+@kernel(_ball_query, "cuda")
+def _(points: Tensor, centres: Tensor, limit: float, k: int) -> Tensor:
+    from pnet.ops.cuda import neighbours as kernels
+
+    return kernels.ball_query(points, centres, limit, k)
+
+
+@kernel(_nearest, "cuda")
+def _(points: Tensor, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    from pnet.ops.cuda import nearest as kernels
+
+    return kernels.nearest(points, queries, k)
+
+
+@kernel(_octants, "cuda")
+def _(points: Tensor, limit: float) -> Tensor:
+    from pnet.ops.cuda import octants as kernels
+
+    return kernels.octants(points, limit)
+
+
 @_ball_query.register_fake
 def _(points: Tensor, centres: Tensor, limit: float, k: int) -> Tensor:
     return points.new_empty(*centres.shape[:2], k, dtype=torch.int64)

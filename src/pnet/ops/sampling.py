@@ -54,6 +54,13 @@ def _(points: Tensor, count: int, start: int) -> Tensor:
     return kernels.farthest_points(points.contiguous(), count, start)
 
 
+@kernel(_farthest_points, "cuda")
+def _(points: Tensor, count: int, start: int) -> Tensor:
+    from pnet.ops.cuda import sampling as kernels
+
+    return kernels.farthest_points(points, count, start)
+
+
 @_farthest_points.register_fake
 def _(points: Tensor, count: int, start: int) -> Tensor:
     return points.new_empty(points.shape[0], count, dtype=torch.int64)

@@ -297,5 +297,7 @@ class KeypointChain:
         sizes = parameters.detach().cpu().double().reshape(-1, len(self.parameters)).numpy()
         try:
             return value(sizes)
-        except ValueError:
+        except ValueError:  # of some row: the others are none the worse for it
+            if len(sizes) > 1:
+                return np.concatenate([self._forgiving(value, torch.from_numpy(row)) for row in sizes])
             return value(np.clip(sizes, self._typical.min(0), self._typical.max(0)))

@@ -12,6 +12,7 @@ the part's symmetry (`pnet.parts.equivalents`).
 import math
 from dataclasses import dataclass
 from enum import Enum
+from functools import lru_cache
 from typing import Protocol
 
 import torch
@@ -109,7 +110,7 @@ class _Around:
     @property
     def direction(self) -> Tensor:
         """From the axis to the template's keypoint."""
-        return _towards(self.around, self.towards)
+        return _towards(_plain(self.around), None if self.towards is None else _plain(self.towards))
 
     @property
     def axis(self) -> Tensor:
@@ -190,7 +191,16 @@ class Corner:
 
 
 def unit(direction: Direction) -> Tensor:
-    """(3,) float64 unit vector of "x", "-z", … or three numbers."""
+    """(3,) float64 unit vector of "x", "-z", … or three numbers; always the same tensor."""
+    return _unit(_plain(direction))
+
+
+def _plain(direction: Direction) -> str | tuple[float, ...]:
+    return direction if isinstance(direction, str) else tuple(direction)
+
+
+@lru_cache
+def _unit(direction: str | tuple[float, ...]) -> Tensor:
     if isinstance(direction, str):
         name = direction.removeprefix("-")
         if name not in _AXES:
@@ -202,13 +212,14 @@ def unit(direction: Direction) -> Tensor:
     return torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float64), dim=0)
 
 
-def _towards(around: Direction, towards: Direction | None) -> Tensor:
-    axis = unit(around)
+@lru_cache
+def _towards(around: str | tuple[float, ...], towards: str | tuple[float, ...] | None) -> Tensor:
+    axis = _unit(around)
     if towards is None:
         if not isinstance(around, str):
             raise ValueError(f"about the axis {around}: say with towards= where the keypoint lies")
         towards = _NEXT[around.removeprefix("-")]
-    direction = unit(towards)
+    direction = _unit(towards)
     if abs(float(axis @ direction)) > 1e-9:
         raise ValueError(f"towards {towards} is not perpendicular to the axis {around}")
     return direction

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pnet.postprocess.grouping import cluster_sizes
 from pnet.postprocess.mean_shift import mean_shift
 
 
@@ -22,25 +23,32 @@ class CentroidClusters:
     min_seed_points: int
     min_points: int
 
-    def __call__(self, centroids: Tensor) -> Tensor:
-        """Cluster the predicted centroids of one scene.
+    def __call__(self, centroids: Tensor, counted: Tensor | None = None) -> Tensor:
+        """Cluster the predicted centroids of every scene.
 
         Args:
-            centroids: (N, 3) metres.
+            centroids: (B, N, 3) metres; a scene that counts one which is no number has no cluster.
+            counted: (B, N) bool, which points are there; None: all.
         Returns:
-            (N,) int64 cluster in [0, d), −1 for points that lie in none.
+            (B, N) int64 cluster, numbered through from scene to scene, −1 for points that lie in none.
         """
-        if len(centroids) == 0 or not bool(torch.isfinite(centroids).all()):
-            return torch.full((len(centroids),), -1)
-        _, labels = mean_shift(centroids.double(), self.bandwidth, self.min_seed_points)
-        return drop_small(labels, self.min_points)
+        if counted is None:
+            counted = torch.ones_like(centroids[..., 0], dtype=torch.bool)
+        sound = (torch.isfinite(centroids).all(-1) | ~counted).all(1, keepdim=True)
+        points = centroids.double()
+        modes, _, labels = mean_shift(points, counted & sound, self.bandwidth, self.min_seed_points)
+        scenes, most, _ = modes.shape
+        first = most * torch.arange(scenes, device=labels.device)[:, None]
+        return drop_small(torch.where(labels >= 0, first + labels, -1), scenes * most, self.min_points)
 
 
-def drop_small(labels: Tensor, min_points: int) -> Tensor:
-    """Clusters of fewer than `min_points` become −1; the others are numbered anew without gaps."""
-    if not bool((labels >= 0).any()):
-        return labels
-    size = torch.bincount(labels[labels >= 0])
-    keep = size >= min_points
+def drop_small(labels: Tensor, d: int, min_points: int) -> Tensor:
+    """Clusters of fewer than `min_points`, or none, become −1; the others are numbered anew without gaps.
+
+    Args:
+        labels: (...) int64 cluster in [0, d), −1 for none; some may have no point.
+    """
+    keep = cluster_sizes(labels, d) >= max(min_points, 1)
     renumbered = torch.where(keep, keep.long().cumsum(0) - 1, -1)
-    return torch.where(labels >= 0, renumbered[labels.clamp(min=0)], labels)
+    # the last entry serves label −1
+    return torch.cat([renumbered, renumbered.new_full((1,), -1)])[labels]

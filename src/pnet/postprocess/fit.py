@@ -3,8 +3,10 @@
 import torch
 from torch import Tensor
 
+from pnet.geometry.constants import converted
 from pnet.geometry.rigid import apply_inverse_pose, apply_pose, fit_rigid
 from pnet.parts.keypoints import KeypointChain
+from pnet.postprocess.kernels import Kernels, step
 
 
 def fit_pose(
@@ -24,11 +26,18 @@ def fit_pose(
     Returns:
         R (..., 3, 3), t (..., 3) part → camera, metres.
     """
+    return fit_template(chain, chain.keypoints_from_parameters(parameters), centroid, keypoints, weight)
+
+
+def fit_template(
+    chain: KeypointChain, template: Tensor, centroid: Tensor, keypoints: Tensor, weight: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """`fit_pose` of a template (..., m, 3) whose keypoints are known, part frame, metres."""
     target = torch.cat([centroid[..., None, :], keypoints], -2)
     if weight is None:
         weight = torch.ones_like(target[..., 0])
-    template = chain.keypoints_from_parameters(parameters)
-    fits = [_fit_chirality(chain, template, target, weight, M.to(target)) for M in chain.chiralities]
+    mirrors = [converted(M, target) for M in chain.chiralities]
+    fits = [_fit_chirality(chain, template, target, weight, M) for M in mirrors]
     R, t, error = fits[0]
     for other_R, other_t, other_error in fits[1:]:
         better = other_error < error
@@ -46,9 +55,10 @@ def _fit_chirality(
     them out, then each is placed on its circle where the observation has it. So the template matches
     the labels' geometry exactly, whatever the view.
     """
-    finite = target.new_tensor([1.0, *map(float, chain.is_finite)])
+    columns = zip(weight.unbind(-1), [True, *chain.is_finite], strict=True)
+    fixed = torch.stack([column if finite else torch.zeros_like(column) for column, finite in columns], -1)
     source = _with_centroid(template) @ mirror.mT
-    R, t = _registration(source, target, weight * finite)
+    R, t = _registration(source, target, fixed)
     if not all(chain.is_finite):
         observed = apply_inverse_pose(R, t, target[..., 1:, :]) @ mirror
         source = _with_centroid(chain.place_like(template, observed)) @ mirror.mT
@@ -58,11 +68,22 @@ def _fit_chirality(
 
 
 def _registration(source: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    plain = source.requires_grad or target.requires_grad or weight.requires_grad
-    if target.device.type == "cpu" and target.dtype == torch.float64 and not plain:
-        from pnet.postprocess.rigid_fits import fit_rigid_many
+    differentiable = source.requires_grad or target.requires_grad or weight.requires_grad
+    if differentiable or target.dtype != torch.float64:
+        return fit_rigid(source, target, weight)
+    return fit_rigid_many(source.expand_as(target), target, weight)
 
-        return fit_rigid_many(source.expand_as(target), target, weight)
+
+@step("fits", Kernels.NUMBA, Kernels.TRITON)
+def fit_rigid_many(source: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotations and translations of `source` onto `target`.
+
+    Args:
+        source, target: (..., n, 3) float64, metres, of one shape. weight: (..., n) non-negative, some
+            positive.
+    Returns:
+        R (..., 3, 3), t (..., 3) metres; see `pnet.geometry.rigid.fit_rigid`.
+    """
     return fit_rigid(source, target, weight)
 
 

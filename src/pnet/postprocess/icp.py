@@ -1,7 +1,7 @@
 """Refinement of poses against the cloud by generalised ICP (Segal et al., RSS 2009), with small_gicp."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -13,6 +13,7 @@ from torch import Tensor
 from pnet.geometry.rigid import rotation_angle
 from pnet.geometry.symmetry import nearest_equivalent
 from pnet.parts.base import ParametricPart, Points
+from pnet.records import Detections
 
 Pose = tuple[Points, Points]
 NEIGHBOURS = 8  # points that tell the direction of the surface at one of them
@@ -70,9 +71,8 @@ class IcpRefinement:
             )
         gicp = _small_gicp()
         R, t = (x.detach().cpu().double().clone() for x in (R, t))
-        cloud, label = points.detach().cpu().double().numpy(), owner.cpu().numpy()
-        for i, size in enumerate(parameters.tolist()):
-            own = cloud[label == i]
+        clouds = _by_owner(points.detach().cpu().double().numpy(), owner.cpu().numpy(), len(R))
+        for i, (size, own) in enumerate(zip(parameters.tolist(), clouds, strict=True)):
             own = own[np.isfinite(own).all(1)]
             if len(own) >= max(self.min_points, LEAST):
                 surface = sample_surface(part, tuple(size), self.model_points)
@@ -125,6 +125,23 @@ class IcpRefinement:
             if len(used) < LEAST:
                 break
         return move[:3, :3], move[:3, 3]
+
+
+def refined(refine: IcpRefinement, part: ParametricPart, found: Detections, points: Tensor) -> Detections:
+    """The instances of all scenes with better poses.
+
+    Args:
+        found: (d) instances, their points' numbers (B, N) among them. points: (B, N, 3) camera frame, metres.
+    """
+    cloud, owner = points.flatten(0, 1).cpu().double(), found.instance.flatten()
+    R, t = refine(part, found.parameters, found.R, found.t, cloud, owner)
+    return replace(found, R=R, t=t)
+
+
+def _by_owner(cloud: Points, owner: NDArray[np.int64], d: int) -> list[Points]:
+    """The points (n, 3) of each of d clusters, in their order. owner: (n,) cluster, −1 for none."""
+    order = np.argsort(owner, kind="stable")
+    return np.split(cloud[order], np.searchsorted(owner[order], np.arange(d + 1)))[1:-1]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,90 +1,93 @@
 """Mean shift with a flat kernel and binned seeds (Comaniciu and Meer 2002, the paper's [22]).
 
 The same clusters as scikit-learn's `MeanShift(bin_seeding=True, cluster_all=False)`, which searches seed
-by seed: here compiled, with a k-d tree; where there is no such kernel all seeds move together, by matrix
-products.
+by seed. Tables over the seeds of B scenes have S columns, as many as the scene with the most has seeds.
 """
 
 import torch
 from torch import Tensor
 
+from pnet.postprocess.climb import climb, distinct, nearest_mode
+
 MAX_STEPS = 300
 STOP = 1e-3  # a seed that moves by less than this share of the bandwidth has arrived
 
 
-def mean_shift(points: Tensor, bandwidth: float, min_seed_points: int) -> tuple[Tensor, Tensor]:
-    """Modes of a point density, and the mode of every point.
+def mean_shift(
+    points: Tensor, counted: Tensor, bandwidth: float, min_seed_points: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Modes of the point density of every scene, and the mode of every point.
 
     Args:
-        points: (N, 3) float64, metres. bandwidth: kernel radius, metres.
+        points: (B, N, 3) float64, metres, finite where counted. counted: (B, N) bool; others are not there.
+        bandwidth: kernel radius, metres.
         min_seed_points: a grid cell of that size needs so many points to start a search.
     Returns:
-        modes (d, 3) metres, the densest first; labels (N,) int64 of the nearest mode, −1 where that is
-        farther than the bandwidth.
+        modes (B, S, 3) metres, a scene's densest first; number (B,) int64 of each scene's modes, what stands
+        behind them means nothing; labels (B, N) int64 of the nearest mode, −1 where that is farther than the
+        bandwidth.
     """
-    seeds = _seeds(points, bandwidth, min_seed_points)
-    if not len(seeds):
-        return seeds, torch.full((len(points),), -1, device=points.device)
-    if points.device.type == "cpu":
-        from pnet.postprocess.neighbourhoods import climb, nearest_mode
-    else:
-        climb, nearest_mode = _climb, _nearest_mode
-    centres, intensity = climb(points, seeds, bandwidth, STOP * bandwidth, MAX_STEPS)
-    seen = intensity > 0
-    modes = _distinct(centres[seen], intensity[seen], bandwidth)
-    return modes, nearest_mode(points, modes, bandwidth)
+    points = points.masked_fill(~counted[..., None], 0.0).contiguous()
+    seeds = find_seeds(points, counted, bandwidth, min_seed_points)
+    centres, intensity = climb(points, counted, seeds, bandwidth, STOP * bandwidth, MAX_STEPS)
+    modes, number = _modes(centres, intensity, bandwidth)
+    labels = nearest_mode(points, modes, number, bandwidth)
+    return modes, number, torch.where(counted, labels, -1)
 
 
-def _seeds(points: Tensor, bandwidth: float, min_seed_points: int) -> Tensor:
-    """(s, 3) middles of the grid cells that hold enough points, metres, by x, then y, then z."""
-    number: Tensor = torch.zeros_like(points[:, 0], dtype=torch.long)
-    known = []
-    for column in (points / bandwidth).round().unbind(1):  # a cell as one number: unique rows are slow
-        values, place = torch.unique(column, return_inverse=True)
-        number = number * len(values) + place
-        known.append(values)
-    cells, count = torch.unique(number, return_counts=True)
-    cells, places = cells[count >= min_seed_points], []
-    for values in reversed(known):
-        places.append(values[cells % max(len(values), 1)])
-        cells = cells // max(len(values), 1)
-    return torch.stack(places[::-1], 1) * bandwidth
+def find_seeds(points: Tensor, counted: Tensor, bandwidth: float, min_seed_points: int) -> Tensor:
+    """Middles of the grid cells that hold enough points; arguments as in `mean_shift`.
+
+    Returns:
+        (B, S, 3) metres, by x, then y, then z; NaN behind a scene's last seed.
+    """
+    B, n, _ = points.shape
+    width = points.new_full((), bandwidth)  # a GPU divides by a plain number less exactly
+    cell = ((points / width).round() + 0.0).reshape(-1, 3)  # no negative zeros
+    scene = torch.arange(B, device=points.device)[:, None].expand(B, n).masked_fill(~counted, B).reshape(-1)
+    order = _sorted_by(scene, *cell.unbind(1))
+    cell, scene = cell[order], scene[order]
+    change = (cell[1:] != cell[:-1]).any(1) | (scene[1:] != scene[:-1])
+    first = torch.cat([change.new_ones(min(len(cell), 1)), change])
+    run = first.long().cumsum(0) - 1
+    size = torch.zeros_like(run).scatter_add_(0, run, torch.ones_like(run))
+    return _table(cell * width, scene, first & (size[run] >= min_seed_points) & (scene < B), B)
 
 
-def _climb(points: Tensor, seeds: Tensor, bandwidth: float, stop: float, steps: int) -> tuple[Tensor, Tensor]:
-    """Plain twin of `neighbourhoods.climb`: all seeds together."""
-    centres, intensity = seeds.clone(), torch.zeros(len(seeds), dtype=points.dtype, device=points.device)
-    active = torch.arange(len(seeds), device=points.device)
-    for _ in range(steps):
-        if not len(active):
-            break
-        within = (torch.cdist(centres[active], points) <= bandwidth).to(points.dtype)
-        count = within.sum(1)
-        mean = within @ points / count.clamp(min=1)[:, None]
-        mean = torch.where(count[:, None] > 0, mean, centres[active])
-        moved = torch.linalg.vector_norm(mean - centres[active], dim=1)
-        centres[active], intensity[active] = mean, count
-        active = active[moved > stop]
-    return centres, intensity
+def _table(rows: Tensor, scene: Tensor, chosen: Tensor, B: int) -> Tensor:
+    """The chosen rows (M, 3), scene after scene, as (B, S, 3) with NaN behind the last of each scene."""
+    number = torch.zeros(B + 1, dtype=torch.int64, device=rows.device).scatter_add_(0, scene, chosen.long())
+    before = number.cumsum(0) - number
+    widest = int(number.max())
+    place = scene * widest + chosen.long().cumsum(0) - 1 - before[scene]
+    table = rows.new_full((B * widest + 1, 3), torch.nan)  # the last row takes what is not chosen
+    table.index_copy_(0, torch.where(chosen, place, B * widest), rows)
+    return table[:-1].view(B, widest, 3)
 
 
-def _nearest_mode(points: Tensor, modes: Tensor, bandwidth: float) -> Tensor:
-    """Plain twin of `neighbourhoods.nearest_mode`."""
-    if not len(modes):
-        return torch.full((len(points),), -1, device=points.device)
-    nearest = torch.cdist(points, modes).min(1)
-    return torch.where(nearest.values <= bandwidth, nearest.indices, -1)
+def _modes(centres: Tensor, intensity: Tensor, bandwidth: float) -> tuple[Tensor, Tensor]:
+    """Of centres within a bandwidth of each other the one with the most points, the densest first.
+
+    Args:
+        centres: (B, S, 3) metres. intensity: (B, S) points around each; where there are none it is no mode.
+    Returns:
+        modes (B, S, 3) metres, number (B,) int64.
+    """
+    # ties in density go by x, then y, then z
+    order = _sorted_by(intensity, *centres.unbind(-1), descending=True)
+    centres, seen = _rows(centres, order), intensity.gather(1, order) > 0
+    kept = distinct(centres, seen, bandwidth)
+    return _rows(centres, torch.argsort((~kept).byte(), dim=1, stable=True)), kept.sum(1)
 
 
-def _distinct(centres: Tensor, intensity: Tensor, bandwidth: float) -> Tensor:
-    """Of centres within a bandwidth of each other the one with the most points, the densest first."""
-    order = torch.arange(len(centres), device=centres.device)
-    for key in (*centres.flip(1).unbind(1), intensity):  # ties in density go by x, then y, then z
-        order = order[torch.argsort(key[order], descending=True, stable=True)]
-    centres = centres[order]
-    near = torch.cdist(centres, centres) <= bandwidth
-    keep = torch.ones(len(centres), dtype=torch.bool)
-    for i in range(len(centres)):
-        if keep[i]:
-            keep[i + 1 :] &= ~near[i, i + 1 :].cpu()
-    return centres[keep.to(centres.device)]
+def _sorted_by(*keys: Tensor, descending: bool = False) -> Tensor:
+    """Places along the last dimension, by the first key, ties by the second, …"""
+    order = torch.argsort(keys[-1], dim=-1, descending=descending, stable=True)
+    for key in reversed(keys[:-1]):
+        next_order = torch.argsort(key.gather(-1, order), dim=-1, descending=descending, stable=True)
+        order = order.gather(-1, next_order)
+    return order
+
+
+def _rows(table: Tensor, order: Tensor) -> Tensor:
+    return table.gather(1, order[..., None].expand(*order.shape, 3))

@@ -1,14 +1,18 @@
-"""The whole right half of the paper's Fig. 5, one scene at a time."""
+"""The whole right half of the paper's Fig. 5."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from pnet.parts.base import ParametricPart
+from pnet.postprocess.batches import in_batches, sound_points
 from pnet.postprocess.cluster import CentroidClusters
+from pnet.postprocess.detections import by_scene, no_detections, on_cpu
 from pnet.postprocess.fit import fit_pose
-from pnet.postprocess.icp import IcpRefinement
+from pnet.postprocess.grouping import Clusters, clusters_of
+from pnet.postprocess.icp import IcpRefinement, refined
 from pnet.postprocess.radius_filter import RadiusFilter
 from pnet.postprocess.score import instance_score, sure_enough
 from pnet.postprocess.vote import PointVotes, Voting
@@ -43,79 +47,63 @@ class PoseRecovery:
     refine: IcpRefinement | None = None
 
     def __call__(
-        self, part: ParametricPart, prediction: PointPrediction, scene: int, points: Tensor | None = None
-    ) -> Detections:
-        """Recover the instances of one scene of a batch.
+        self, part: ParametricPart, prediction: PointPrediction, points: Tensor | None = None
+    ) -> list[Detections]:
+        """Recover the instances of every scene of a batch.
 
         Args:
-            part: the template. prediction: of a batch. scene: index into the batch.
-            points: (N, 3) the scene's cloud, camera frame, metres; for `refine`.
+            part: the template. prediction: of B scenes; one that says what is no number has no instances.
+            points: (B, N, 3) the scenes' clouds, camera frame, metres; for `refine`.
         """
-        centroids = prediction.centroid[scene].cpu().double()
-        keypoints = prediction.keypoints[scene].cpu().double()
-        labels = self.cluster(centroids)
-        if not bool(torch.isfinite(keypoints).all()):  # a network that has diverged finds nothing
-            labels = torch.full_like(labels, -1)
-        d = int(labels.max()) + 1 if len(labels) else 0
-        if d == 0:
-            return no_detections(part, len(labels))
-        visibility = None if prediction.visibility is None else prediction.visibility[scene]
-        score = instance_score(visibility, labels, d)
-        votes = PointVotes(centroids, keypoints, labels, d, self._reliable(centroids, keypoints, labels))
-        agreed = self.voting(part, votes)
-        parameters = self._share(agreed.parameters, score)
-        if part.is_fixed:
-            parameters = torch.from_numpy(part.grids["L"][0]).expand_as(parameters).clone()
+        if self.refine is not None and points is None:
+            raise ValueError("postprocess.refine needs the scenes' points")
+        return in_batches(partial(self._recover, part), prediction, points)
+
+    def _recover(
+        self, part: ParametricPart, prediction: PointPrediction, points: Tensor | None
+    ) -> list[Detections]:
+        said = prediction.keypoints, prediction.visibility
+        clusters = clusters_of(self.cluster(prediction.centroid, sound_points(*said)))
+        if not len(clusters.groups):
+            return [no_detections(part, len(own)) for own in clusters.owner]
+        score = instance_score(prediction.visibility, clusters)
+        agreed = self.voting(part, self._votes(prediction, clusters))
+        parameters = self._sizes(part, agreed.parameters, score, clusters.scenes)
         weight = None if self.trust is None else 1 / (agreed.spread.square() + self.trust**2)
         R, t = fit_pose(part.chain, parameters, agreed.centroid, agreed.keypoints, weight)
-        if self.refine is not None:
-            if points is None:
-                raise ValueError("postprocess.refine needs the scene's points")
-            R, t = self.refine(part, parameters, R, t, points.cpu().double(), labels)
-        found = Detections(R, t, parameters, score, agreed.keypoints, labels)
-        return best_first(found, sure_enough(score, visibility, self.visibility_threshold))
+        found = on_cpu(Detections(R, t, parameters, score, agreed.keypoints, clusters.owner))
+        if self.refine is not None and points is not None:
+            found = refined(self.refine, part, found, points)
+        sure = sure_enough(found.score, prediction.visibility, self.visibility_threshold)
+        return by_scene(found, sure, clusters.scenes)
 
-    def _reliable(self, centroids: Tensor, keypoints: Tensor, labels: Tensor) -> Tensor:
-        """(N, 1 + m) or (N, 1) which votes count: those in a cluster that the radius filter keeps."""
-        places = centroids[:, None]
+    def _votes(self, prediction: PointPrediction, clusters: Clusters) -> PointVotes:
+        """What the clustered points say, and whose word the radius filter takes."""
+        centroid, keypoints = (
+            clusters.of(said).double() for said in (prediction.centroid, prediction.keypoints)
+        )
+        places = centroid[:, None]
         if self.voting.filters_keypoints:
             places = torch.cat([places, keypoints], 1)
         if self.radius_filter is None:
-            return (labels >= 0)[:, None].expand(-1, places.shape[1])
-        return torch.stack([self.radius_filter(votes, labels) for votes in places.unbind(1)], 1)
+            reliable = torch.ones_like(places[..., 0], dtype=torch.bool)
+        else:
+            reliable = self.radius_filter(places, clusters.groups)
+        return PointVotes(centroid, keypoints, clusters.groups, reliable)
 
-    def _share(self, parameters: Tensor, score: Tensor) -> Tensor:
-        """(d, k) parameters, those of a scene's best visible instances for all if `scene_parameters`."""
+    def _sizes(self, part: ParametricPart, parameters: Tensor, score: Tensor, scenes: list[int]) -> Tensor:
+        """(d, k) the part's own where it has one size only, else those voted, each or by scene."""
+        if part.is_fixed:
+            return torch.from_numpy(part.grids["L"][0]).to(parameters).expand_as(parameters).clone()
         if not self.scene_parameters:
             return parameters
+        # small numbers, which the CPU adds up in the same order for any device
+        known = zip(*(x.split(scenes) for x in (parameters.cpu(), score.cpu())), strict=True)
+        return torch.cat([self._shared(*own) for own in known]).to(parameters)
+
+    def _shared(self, parameters: Tensor, score: Tensor) -> Tensor:
+        """(d, k) the mean parameters of one scene's best visible instances, for all."""
+        if not len(score):
+            return parameters
         best = score >= self.best_visible * score.max()
-        return parameters[best].mean(0).expand_as(parameters).clone()
-
-
-def best_first(found: Detections, keep: Tensor) -> Detections:
-    """The kept detections by falling score; their points' cluster numbers follow, others become −1."""
-    order = torch.argsort(found.score, descending=True, stable=True)
-    order = order[keep[order]]
-    place = torch.full((len(keep) + 1,), -1)  # the last entry serves label −1
-    place[order] = torch.arange(len(order))
-    return Detections(
-        found.R[order],
-        found.t[order],
-        found.parameters[order],
-        found.score[order],
-        found.keypoints[order],
-        place[found.instance],
-    )
-
-
-def no_detections(part: ParametricPart, points: int) -> Detections:
-    """Nothing found in a scene of so many points."""
-    empty = torch.zeros(0, 3, 3, dtype=torch.float64)
-    return Detections(
-        R=empty,
-        t=empty[:, 0],
-        parameters=torch.zeros(0, part.k, dtype=torch.float64),
-        score=torch.zeros(0, dtype=torch.float64),
-        keypoints=torch.zeros(0, len(part.chain), 3, dtype=torch.float64),
-        instance=torch.full((points,), -1),
-    )
+        return parameters[best].mean(0).expand_as(parameters)

@@ -1,7 +1,8 @@
 """PPR-Net's post-processing: the poses that a cluster's points predict are averaged."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -10,10 +11,11 @@ from torch import Tensor
 from pnet.geometry.rigid import apply_pose
 from pnet.geometry.rotation_mean import mean_rotation
 from pnet.parts.base import ParametricPart
+from pnet.postprocess.batches import in_batches, sound_points
 from pnet.postprocess.cluster import CentroidClusters
-from pnet.postprocess.folded_vote import members
-from pnet.postprocess.icp import IcpRefinement
-from pnet.postprocess.pipeline import best_first, no_detections
+from pnet.postprocess.detections import by_scene, no_detections, on_cpu
+from pnet.postprocess.grouping import clusters_of
+from pnet.postprocess.icp import IcpRefinement, refined
 from pnet.postprocess.score import instance_score, sure_enough
 from pnet.postprocess.vote import vote
 from pnet.records import Detections, PosePrediction
@@ -42,42 +44,47 @@ class PoseAveraging:
     refine: IcpRefinement | None = None
 
     def __call__(
-        self, part: ParametricPart, prediction: PosePrediction, scene: int, points: Tensor | None = None
-    ) -> Detections:
-        """Recover the instances of one scene of a batch.
+        self, part: ParametricPart, prediction: PosePrediction, points: Tensor | None = None
+    ) -> list[Detections]:
+        """Recover the instances of every scene of a batch.
 
         Args:
-            part: the template. prediction: of a batch. scene: index into the batch.
-            points: (N, 3) the scene's cloud, camera frame, metres; for `refine`.
+            part: the template. prediction: of B scenes; one with a rotation that is no number has none.
+            points: (B, N, 3) the scenes' clouds, camera frame, metres; for `refine`.
         """
-        centroids, rotations = (
-            value[scene].cpu().double() for value in (prediction.centroid, prediction.rotation)
-        )
-        visibility = None if prediction.visibility is None else prediction.visibility[scene].cpu().double()
-        labels = self._segment(centroids, visibility)
-        d = int(labels.max()) + 1 if len(labels) else 0
-        if d == 0 or not bool(torch.isfinite(rotations).all()):
-            return no_detections(part, len(labels))
-        t = vote(centroids, labels, labels >= 0, d)
-        member, valid = members(labels, d, self.votes)
-        R = mean_rotation(rotations[member], valid.double(), part.symmetry, math.radians(self.width))
-        parameters = known_parameters(part, d)
-        if self.refine is not None:
-            if points is None:
-                raise ValueError("postprocess.refine needs the scene's points")
-            R, t = self.refine(part, parameters, R, t, points.cpu().double(), labels)
-        score = instance_score(visibility, labels, d)
-        found = Detections(R, t, parameters, score, _keypoints(part, parameters, R, t), labels)
-        return best_first(found, sure_enough(score, visibility, self.visibility_threshold))
+        if self.refine is not None and points is None:
+            raise ValueError("postprocess.refine needs the scenes' points")
+        return in_batches(partial(self._recover, part), prediction, points)
 
-    def _segment(self, centroids: Tensor, visibility: Tensor | None) -> Tensor:
-        """(N,) cluster, −1 for none: of the points that are visible enough."""
-        if visibility is None:
-            return self.cluster(centroids)
-        seen = visibility >= self.visibility_threshold
-        labels = torch.full((len(centroids),), -1)
-        labels[seen] = self.cluster(centroids[seen])
-        return labels
+    def _recover(
+        self, part: ParametricPart, prediction: PosePrediction, points: Tensor | None
+    ) -> list[Detections]:
+        clusters = clusters_of(self.cluster(prediction.centroid, self._seen(prediction)))
+        groups = clusters.groups
+        if not len(groups):
+            return [no_detections(part, len(own)) for own in clusters.owner]
+        t = vote(clusters.of(prediction.centroid).double(), groups)
+        member, valid = groups.first(self.votes)
+        rotations = clusters.of(prediction.rotation).double()[member]
+        R = mean_rotation(rotations, valid.double(), part.symmetry, math.radians(self.width))
+        parameters = known_parameters(part, len(groups))
+        unknown = t.new_full((len(groups), len(part.chain), 3), math.nan)
+        score = instance_score(prediction.visibility, clusters)
+        found = on_cpu(Detections(R, t, parameters.to(t), score, unknown, clusters.owner))
+        if self.refine is not None and points is not None:
+            found = refined(self.refine, part, found, points)
+        if not bool(parameters.isnan().any()):  # parts need not bear NaN
+            places = part.chain.keypoints_from_parameters(parameters)
+            found = replace(found, keypoints=apply_pose(found.R, found.t, places))
+        sure = sure_enough(found.score, prediction.visibility, self.visibility_threshold)
+        return by_scene(found, sure, clusters.scenes)
+
+    def _seen(self, prediction: PosePrediction) -> Tensor:
+        """(B, N) bool, which points count: those that are visible enough."""
+        sound = sound_points(prediction.rotation)
+        if prediction.visibility is None:
+            return sound
+        return sound & (prediction.visibility.double() >= self.visibility_threshold)
 
 
 def known_parameters(part: ParametricPart, d: int) -> Tensor:
@@ -85,10 +92,3 @@ def known_parameters(part: ParametricPart, d: int) -> Tensor:
     grid = torch.from_numpy(np.concatenate(list(part.grids.values())))
     row = grid[0] if bool((grid == grid[0]).all()) else torch.full_like(grid[0], math.nan)
     return row.expand(d, -1).clone()
-
-
-def _keypoints(part: ParametricPart, parameters: Tensor, R: Tensor, t: Tensor) -> Tensor:
-    """(d, m, 3) camera frame, metres; NaN without parameters: parts need not bear NaN."""
-    if bool(parameters.isnan().any()):
-        return torch.full((len(R), len(part.chain), 3), math.nan, dtype=torch.float64)
-    return apply_pose(R, t, part.chain.keypoints_from_parameters(parameters))

@@ -2,8 +2,10 @@
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
+
+from pnet.postprocess.grouping import Groups
+from pnet.postprocess.neighbour_count import near_enough
 
 
 @dataclass(frozen=True)
@@ -22,20 +24,20 @@ class RadiusFilter:
     max_radius: float
     enough: float
 
-    def __call__(self, votes: Tensor, labels: Tensor) -> Tensor:
+    def __call__(self, votes: Tensor, groups: Groups) -> Tensor:
         """Which votes count; every cluster keeps at least one, so the number of clusters stays.
 
         Args:
-            votes: (N, 3) metres. labels: (N,) cluster, −1 for none.
+            votes: (M, q, 3) metres; each column has a verdict of its own. groups: how they stand.
         Returns:
-            (N,) bool; False where the label is −1.
+            (M, q) bool.
         """
-        from pnet.postprocess.neighbourhoods import near_enough
+        return near_enough(votes.double(), groups, self.neighbours, self.enough, self._radii())
 
-        order = torch.argsort(labels, stable=True)[int((labels < 0).sum()) :]
-        end = torch.bincount(labels[order]).cumsum(0).cpu()
-        widening = (self.radius, self.widen, self.max_radius)
-        near = near_enough(votes[order].double().cpu(), end, self.neighbours, self.enough, widening)
-        kept = torch.zeros_like(labels, dtype=torch.bool)
-        kept[order] = near.to(kept.device)
-        return kept
+    def _radii(self) -> tuple[float, ...]:
+        """All that are tried, metres."""
+        radii = [self.radius]
+        # a nanometre of slack: 0.01 + 5 · 0.002 is a little more than 0.02 in floating point
+        while self.widen > 0 and radii[-1] + self.widen <= self.max_radius + 1e-9:
+            radii.append(radii[-1] + self.widen)
+        return tuple(radii)

@@ -1,23 +1,22 @@
 """How sure an instance is: its visibility as its points see it, or its size."""
 
-import torch
 from torch import Tensor
 
+from pnet.postprocess.grouping import Clusters
 from pnet.postprocess.vote import vote
 
 
-def instance_score(visibility: Tensor | None, labels: Tensor, d: int) -> Tensor:
+def instance_score(visibility: Tensor | None, clusters: Clusters) -> Tensor:
     """Score of every cluster.
 
     Args:
-        visibility: (N,) predicted of each point, or None without M_V.
-        labels: (N,) cluster in [0, d), −1 for none. d: number of clusters.
+        visibility: (B, N) predicted of each point, or None without M_V. clusters: of the B scenes.
     Returns:
-        (d,) float64 mean visibility of its points; without M_V the share of the scene's points in it.
+        (d,) float64 mean visibility of its points; without M_V the share of its scene's points in it.
     """
-    if visibility is not None:
-        return vote(visibility.cpu().double(), labels, labels >= 0, d)
-    return torch.bincount(labels[labels >= 0], minlength=d).double() / len(labels)
+    if visibility is None:
+        return clusters.groups.size.double() / clusters.owner.shape[1]
+    return vote(clusters.of(visibility).double(), clusters.groups)
 
 
 def sure_enough(score: Tensor, visibility: Tensor | None, threshold: float) -> Tensor:

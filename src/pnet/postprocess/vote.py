@@ -6,24 +6,24 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
+from pnet.ops.gathering import scatter_sum
 from pnet.parts.base import ParametricPart
+from pnet.postprocess.grouping import Groups
 
 
 @dataclass(frozen=True, eq=False)
 class PointVotes:
-    """What the points of one scene say of their instances.
+    """What the clustered points say of their instances.
 
     Attributes:
-        centroid: (N, 3), keypoints: (N, m, 3) camera frame, metres.
-        owner: (N,) cluster in [0, d), −1 for none. d: number of clusters.
-        reliable: (N, 1 + m) bool: which votes for the centroid and each keypoint count, at least one a
-            cluster; (N, 1) for a voting that weighs keypoints in its own way.
+        centroid: (M, 3), keypoints: (M, m, 3) camera frame, metres. groups: how they stand.
+        reliable: (M, 1 + m) bool: which votes for the centroid and each keypoint count, at least one a
+            cluster; (M, 1) for a voting that weighs keypoints in its own way.
     """
 
     centroid: Tensor
     keypoints: Tensor
-    owner: Tensor
-    d: int
+    groups: Groups
     reliable: Tensor
 
 
@@ -66,39 +66,42 @@ class MeanVote:
     def __call__(self, part: ParametricPart, votes: PointVotes) -> InstanceVotes:
         """Means of centroids, keypoints and, point by point (module M_P), parameters."""
         targets = torch.cat([votes.centroid[:, None], votes.keypoints], 1)
-        voted, spread = [], []
-        for values, kept in zip(targets.unbind(1), votes.reliable.unbind(1), strict=True):
-            voted.append(vote(values, votes.owner, kept, votes.d))
-            spread.append(vote_spread(values, votes.owner, kept, voted[-1]))
-        places = torch.stack(voted, 1)
+        places = vote(targets, votes.groups, votes.reliable)
+        spread = vote_spread(targets, votes.groups, places, votes.reliable)
         per_point = part.chain.parameters_from_keypoints(votes.centroid, votes.keypoints)
-        parameters = vote(per_point, votes.owner, votes.owner >= 0, votes.d)
-        return InstanceVotes(places[:, 0], places[:, 1:], parameters, torch.stack(spread, 1))
+        return InstanceVotes(places[:, 0], places[:, 1:], vote(per_point, votes.groups), spread)
 
 
-def vote(values: Tensor, labels: Tensor, kept: Tensor, clusters: int) -> Tensor:
+def vote(values: Tensor, groups: Groups, kept: Tensor | None = None) -> Tensor:
     """Mean of the counted votes of each cluster.
 
     Args:
-        values: (N, ...) votes. labels: (N,) cluster, −1 for none. kept: (N,) bool, which votes count.
-        clusters: d.
+        values: (M, ...) votes. groups: how they stand.
+        kept: (M,) bool, which votes count, at least one a cluster, or (M, q) for votes (M, q, ...) of which
+            each column has its own; None: all count.
     Returns:
-        (d, ...) means; every cluster must have a counted vote.
+        (d, ...) means.
     """
-    chosen, owner = values[kept], labels[kept]
-    total = chosen.new_zeros(clusters, *values.shape[1:]).index_add_(0, owner, chosen)
-    count = chosen.new_zeros(clusters).index_add_(0, owner, chosen.new_ones(len(owner)))
-    mean: Tensor = total / count.view(-1, *[1] * (values.ndim - 1))
-    return mean
+    if kept is None:
+        kept = torch.ones(len(values), dtype=torch.bool, device=values.device)
+    over = kept.view(*kept.shape, *[1] * (values.ndim - kept.ndim))
+    total = _sums(values.masked_fill(~over, 0), groups)
+    return total / _sums(over.to(values), groups)
 
 
-def vote_spread(values: Tensor, labels: Tensor, kept: Tensor, means: Tensor) -> Tensor:
+def vote_spread(values: Tensor, groups: Groups, means: Tensor, kept: Tensor) -> Tensor:
     """Root mean square distance of the counted votes from their mean.
 
     Args:
-        values: (N, 3) votes, metres. labels, kept: as in `vote`. means: (d, 3) what `vote` gave, metres.
+        values: (M, ..., 3) votes, metres. groups, kept: as in `vote`. means: (d, ..., 3) what `vote` gave.
     Returns:
-        (d,) metres; large where a keypoint's label is ambiguous and the votes disagree.
+        (d, ...) metres; large where a keypoint's label is ambiguous and the votes disagree.
     """
-    off = (values - means[labels.clamp(min=0)]).square().sum(-1)
-    return vote(off, labels, kept, len(means)).sqrt()
+    off = (values - means[groups.owner]).square().sum(-1)
+    return vote(off, groups, kept).sqrt()
+
+
+def _sums(rows: Tensor, groups: Groups) -> Tensor:
+    """(d, ...) sums of the rows (M, ...) of each cluster, in their order."""
+    flat = rows.reshape(1, len(rows), rows.shape[1:].numel())
+    return scatter_sum(flat, groups.owner.view(1, -1, 1), len(groups)).view(len(groups), *rows.shape[1:])

@@ -8,6 +8,8 @@ from torch import Tensor
 
 from pnet.ops.cpu.compiled import in_parts, kernel
 from pnet.ops.cpu.tree import Array
+from pnet.ops.gathering import check_table
+from pnet.ops.grouping import check_winners
 
 BLOCK = 16  # channels that one owner adds up, at least: a cache line of float32
 ROWS = 64  # rows that pay for a thread
@@ -16,8 +18,9 @@ NONE = torch.empty(0, 0, 0)
 
 def gather_sum(rows: Tensor, index: Tensor, weight: Tensor | None) -> Tensor:
     """See `pnet.ops.gathering`."""
-    _check(index, len(rows), rows.shape[1])
-    values = _full(rows)
+    check_table(index, rows, 1, weight)
+    _check(index, rows.shape[1])
+    values = full(rows)
     out = values.new_empty(*index.shape[:2], rows.shape[2])
     arrays = values.numpy(), index.contiguous().numpy(), _weight(weight, values).numpy(), out.numpy()
     in_parts(lambda a, b: _gather_sum(*arrays, a, b), index.shape[0] * index.shape[1], ROWS)
@@ -26,8 +29,9 @@ def gather_sum(rows: Tensor, index: Tensor, weight: Tensor | None) -> Tensor:
 
 def scatter_sum(rows: Tensor, index: Tensor, weight: Tensor | None, n: int) -> Tensor:
     """See `pnet.ops.gathering`."""
-    _check(index, len(rows), n)
-    values = _full(rows)
+    check_table(index, rows, 2, weight)
+    _check(index, n)
+    values = full(rows)
     out = values.new_zeros(len(rows), n, rows.shape[2])
     arrays = values.numpy(), index.contiguous().numpy(), _weight(weight, values).numpy(), out.numpy()
     blocks = _blocks(rows)
@@ -37,8 +41,9 @@ def scatter_sum(rows: Tensor, index: Tensor, weight: Tensor | None, n: int) -> T
 
 def gather_max(rows: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
     """See `pnet.ops.gathering`."""
-    _check(index, len(rows), rows.shape[1])
-    values = _full(rows)
+    check_table(index, rows, 1)
+    _check(index, rows.shape[1])
+    values = full(rows)
     out = values.new_empty(*index.shape[:2], rows.shape[2])
     winner = torch.empty(out.shape, dtype=torch.int32)
     arrays = values.numpy(), index.contiguous().numpy(), out.numpy(), winner.numpy()
@@ -48,8 +53,9 @@ def gather_max(rows: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
 
 def scatter_max(grad: Tensor, winner: Tensor, n: int) -> Tensor:
     """See `pnet.ops.gathering`."""
-    _check(winner, len(grad), n)
-    values = _full(grad)
+    check_winners(winner, grad)
+    _check(winner, n)
+    values = full(grad)
     out = values.new_zeros(len(grad), n, grad.shape[2])
     arrays = values.numpy(), winner.contiguous().numpy(), out.numpy()
     blocks = _blocks(grad)
@@ -57,16 +63,14 @@ def scatter_max(grad: Tensor, winner: Tensor, n: int) -> Tensor:
     return out.to(grad.dtype)
 
 
-def _check(index: Tensor, clouds: int, n: int) -> None:
+def _check(index: Tensor, n: int) -> None:
     """Compiled code reads where it is told: a table of another cloud must not get there."""
-    if len(index) != clouds or index.shape[2] == 0:
-        raise ValueError(f"an index of shape {tuple(index.shape)} does not fit {clouds} clouds of {n} rows")
     low, high = index.aminmax() if index.numel() else (0, 0)
     if low < 0 or high >= max(n, 1):
         raise IndexError(f"index {int(low)} to {int(high)} into {n} rows: a table of another cloud?")
 
 
-def _full(rows: Tensor) -> Tensor:
+def full(rows: Tensor) -> Tensor:
     """Contiguous float32 or float64: numba knows no shorter ones."""
     short = rows.dtype in (torch.bfloat16, torch.float16)
     return (rows.float() if short else rows).detach().contiguous()

@@ -11,14 +11,7 @@ SWEEPS = 20  # of Jacobi's method, which needs some five
 
 
 def fit_rigid_many(source: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotations and translations of `source` onto `target`, by Horn's quaternions (1987).
-
-    Args:
-        source, target: (..., n, 3) float64, metres, of one shape. weight: (..., n) non-negative, some
-            positive.
-    Returns:
-        R (..., 3, 3), t (..., 3) metres; see `pnet.geometry.rigid.fit_rigid`, its plain twin.
-    """
+    """See `pnet.postprocess.fit`; by Horn's quaternions (1987)."""
     shape = target.shape[:-2]
     flat = [x.reshape(-1, *x.shape[len(shape) :]).contiguous() for x in (source, target, weight)]
     R, t = target.new_empty(len(flat[0]), 3, 3), target.new_empty(len(flat[0]), 3)

@@ -5,7 +5,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from pnet.geometry.rigid import apply_pose, fit_rigid
-from pnet.postprocess.rigid_fits import fit_rigid_many
+from pnet.postprocess.cpu.fits import fit_rigid_many
 
 
 def clouds(rows: int, n: int, seed: int = 0) -> tuple[torch.Tensor, ...]:

@@ -1,4 +1,4 @@
-"""Robust means on the CPU, compiled: `folded_vote.location` cluster by cluster, so without padding."""
+"""Robust means on the CPU, compiled: cluster by cluster, so without padding."""
 
 import numpy as np
 from torch import Tensor
@@ -8,14 +8,7 @@ from pnet.ops.cpu.tree import Array
 
 
 def locate(values: Tensor, valid: Tensor, cut: float, floor: float, rounds: int) -> tuple[Tensor, Tensor]:
-    """Tukey's biweight about the median.
-
-    Args:
-        values: (d, n, c). valid: (d, n) bool, some True in each row. cut: see `FoldedVote`.
-        floor: the least scale. rounds: of re-weighting, one at least.
-    Returns:
-        location (d, c), spread (d,).
-    """
+    """See `pnet.postprocess.location`."""
     centre, spread = values.new_empty(len(values), values.shape[2]), values.new_empty(len(values))
     given = values.contiguous().numpy(), valid.contiguous().numpy(), cut, floor, rounds
     found = centre.numpy(), spread.numpy()
