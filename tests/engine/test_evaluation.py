@@ -106,11 +106,10 @@ class Counting:
     def estimate(self, points):
         n = points.shape[1]
         zero = torch.zeros(n, 3)
-        return [
-            Detections(
-                zero[:, None].expand(n, 3, 3), zero, zero, zero[:, 0], zero[:, None], zero[:, 0].long()
-            )
-        ]
+        found = Detections(
+            zero[:, None].expand(n, 3, 3), zero, zero, zero[:, 0], zero[:, None], zero[:, 0].long()
+        )
+        return [found for _ in points]
 
 
 def test_predicting_takes_a_prefix_of_the_points_and_tells_its_progress(tn34, make_scene):
@@ -118,6 +117,14 @@ def test_predicting_takes_a_prefix_of_the_points_and_tells_its_progress(tn34, ma
     assert [len(d.score) for d in predict_scenes(Counting(tn34), scenes, None, steps.append)] == [20, 50]
     assert [len(d.score) for d in predict_scenes(Counting(tn34), scenes, 30)] == [20, 30]
     assert steps == [1, 1]
+
+
+def test_scenes_of_one_size_are_given_some_at_a_time(tn34, make_scene):
+    """In order, each once."""
+    sizes = [20] * 19 + [30, 20, 20]
+    scenes, steps = [make_scene(tn34, points=n) for n in sizes], []
+    assert [len(d.score) for d in predict_scenes(Counting(tn34), scenes, None, steps.append)] == sizes
+    assert steps == [8, 8, 3, 1, 2]
 
 
 @pytest.fixture

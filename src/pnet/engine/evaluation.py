@@ -1,9 +1,11 @@
 """Evaluation in two steps: predict, then score what was predicted."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import groupby, islice
 
 import torch
+from torch import Tensor
 
 from pnet.engine.method import Method
 from pnet.geometry.pose_space import PoseSpace
@@ -11,6 +13,8 @@ from pnet.metrics.matching import ScoredPoses, TruePoses
 from pnet.metrics.pose_metric import PoseMetrics
 from pnet.parts.base import ParametricPart
 from pnet.records import Detections, Scene
+
+AT_ONCE = 8  # scenes that a method is given
 
 
 def predict_scenes(
@@ -22,15 +26,24 @@ def predict_scenes(
     """Detections of every scene.
 
     Args:
-        method: any. scenes: in order. points: N, the first so many of a scene's; None: all.
-        advance: called with the number of scenes done, after each.
+        method: any; is given some scenes at once, which a network on a GPU takes together.
+        scenes: in order. points: N, the first so many of a scene's; None: all.
+        advance: called with the number of scenes done, after each of those calls.
     """
-    found = []
-    for index in range(len(scenes)):
-        cloud = torch.from_numpy(scenes[index].points[:points])
-        found += method.estimate(cloud[None])
-        advance(1)
+    found: list[Detections] = []
+    clouds = (torch.from_numpy(scenes[i].points[:points]) for i in range(len(scenes)))
+    for _, alike in groupby(clouds, len):  # a converted data set's scenes may differ
+        for batch in batched(alike, AT_ONCE):
+            found += method.estimate(torch.stack(batch))
+            advance(len(batch))
     return found
+
+
+def batched(clouds: Iterable[Tensor], size: int) -> Iterator[list[Tensor]]:
+    """So many at a time, the rest at the end."""
+    clouds = iter(clouds)
+    while batch := list(islice(clouds, size)):
+        yield batch
 
 
 class SceneScorer:
