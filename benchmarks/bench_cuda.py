@@ -137,8 +137,10 @@ def measure_bounds(meter: Meter, size: int) -> Bounds:
     copied = 2 * large[0].numel() * 4 / meter.ms(torch.clone, large)
     products = {}
     for precision in Precision:
+        dtype = torch.bfloat16 if precision is Precision.BF16 else torch.float32
+        factors = [matrix.to(dtype) for matrix in large]
         with precision.numbers(meter.device.type):
-            products[precision] = size**3 / meter.ms(lambda a: a @ large[0], large)
+            products[precision] = size**3 / meter.ms(lambda a: a @ factors[0], factors)  # noqa: B023
     seen = ", ".join(f"{name} {2 * rate / 1e9:.0f} TFLOP/s" for name, rate in products.items())
     print(f"this device: copies {copied / 1e6:.0f} GB/s; products {seen}")
     return Bounds(copied, products)

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from pnet.cli.app import config_dir, run_name
+from pnet.cli.app import chosen_operators, config_dir, run_name
 
 COMMANDS = ("generate", "train", "evaluate", "report", "score", "info")
 
@@ -130,6 +130,40 @@ def test_an_interruption_is_one_line_and_130(run_here, tmp_path, monkeypatch):
     outcome = run_here(tmp_path, "score", "truth=a", "results=b", "poseutils=c")
     assert outcome.code == 130
     assert len(outcome.err.strip().splitlines()) == 1 and outcome.err.startswith("interrupted")
+
+
+PLAIN = """
+from pnet.cli.app import chosen_operators
+
+with chosen_operators({choice!r}):  # before anything of torch is imported, as in a command
+    import torch
+    from pnet.ops.cpu import neighbours
+    from pnet.ops.neighbours import octants
+    from pnet.postprocess.kernels import kernels_for
+
+    def fail(*_):
+        raise LookupError("the kernel runs")
+
+    neighbours.octants = fail
+    octants(torch.rand(1, 9, 3), 0.1)
+    print(kernels_for(torch.zeros(1)).name)
+"""
+
+
+def test_reference_operators_run_in_place_of_every_kernel():
+    runs = {
+        choice: subprocess.run(
+            [sys.executable, "-c", PLAIN.format(choice=choice)], capture_output=True, text=True
+        )
+        for choice in ("reference", "kernels")
+    }
+    assert runs["reference"].stdout == "PLAIN\n", runs["reference"].stderr
+    assert "LookupError: the kernel runs" in runs["kernels"].stderr
+
+
+def test_another_choice_of_operators_is_refused():
+    with pytest.raises(ValueError, match="ops is 'plain', choose kernels or reference"):
+        chosen_operators("plain")
 
 
 def test_info_prints_versions(run_here, tmp_path):

@@ -10,7 +10,7 @@ from pnet.engine.depth_estimator import DepthEstimator
 from pnet.engine.method import NetworkMethod, Timing
 from pnet.geometry.camera import Camera
 from pnet.ops.sampling import farthest_point_order
-from pnet.postprocess.pipeline import no_detections
+from pnet.postprocess.detections import no_detections
 from pnet.records import Detections
 from pnet.scenes.rendering import render_view
 

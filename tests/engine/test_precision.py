@@ -22,10 +22,10 @@ def _as_before():
     torch.backends.cudnn.allow_tf32 = before[1]
 
 
-@pytest.mark.parametrize("name", ["32", "tf32", "bf16"])
+@pytest.mark.parametrize("name", ["32", 32, "tf32", "bf16"])
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 def test_a_name_is_what_it_says(name, device):
-    assert Precision.of(name, device) == name
+    assert Precision.of(name, device) == str(name)
 
 
 @pytest.mark.parametrize("hardware, expected", [(True, "bf16"), (False, "32")])

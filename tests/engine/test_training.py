@@ -12,7 +12,7 @@ from pnet.backbones.range_unet import RangeUNet
 from pnet.data.augmentation import Augmentation
 from pnet.data.module import SceneDataModule, Targets
 from pnet.data.source import StoredData
-from pnet.engine.callbacks import PoseValidation, Throughput
+from pnet.engine.callbacks import PoseValidation, SparingBar, Throughput
 from pnet.engine.checkpoints import NAME, ResumableCheckpoint, read_checkpoint
 from pnet.engine.method import NetworkMethod
 from pnet.engine.precision import Precision
@@ -69,6 +69,7 @@ def fit(
     extra=(),
     rule="camera",
     compiled=False,
+    bar=False,
 ):
     """Train for nine steps of two scenes; a checkpoint every three."""
     lightning.seed_everything(seed, verbose=False)
@@ -91,12 +92,30 @@ def fit(
         check_val_every_n_epoch=1,
         callbacks=callbacks,
         logger=False,
-        enable_progress_bar=False,
+        enable_progress_bar=bar,
         enable_model_summary=False,
         num_sanity_val_steps=0,
     )
     trainer.fit(module, datamodule=data, ckpt_path=folder / NAME if resume else None, weights_only=True)
     return SimpleNamespace(weights=network.state_dict(), trainer=trainer, data=data)
+
+
+def test_the_bar_reads_the_losses_only_where_it_draws_them(root, tn34, tmp_path, monkeypatch):
+    """On a GPU each reading waits until the step is done."""
+    reads = []
+
+    def counted(read):
+        return lambda tensor: (reads.append(1), read(tensor))[1]
+
+    for name in ("item", "__float__"):
+        monkeypatch.setattr(torch.Tensor, name, counted(getattr(torch.Tensor, name)))
+    spent = {}
+    for refresh in (None, 3, 1):
+        reads.clear()
+        bar = [] if refresh is None else [SparingBar(refresh)]
+        fit(root, tn34, tmp_path / str(refresh), pointnet2, extra=bar, bar=bool(bar))
+        spent[refresh] = len(reads)
+    assert spent[3] - spent[None] <= 20 < spent[1] - spent[None]
 
 
 @pytest.mark.parametrize("backbone", [pointnet2, range_unet])

@@ -19,6 +19,15 @@ def test_a_copy_is_made_once_a_kind():
     assert converted(constant, torch.zeros(1)) is single
 
 
+def test_a_copy_made_in_inference_serves_a_training():
+    constant = torch.tensor([2.0, 3.0], dtype=torch.float64)
+    with torch.inference_mode():
+        converted(constant, torch.zeros(1))
+    learnt = torch.ones(2, requires_grad=True)
+    (learnt * converted(constant, learnt)).sum().backward()
+    assert learnt.grad.tolist() == [2.0, 3.0]
+
+
 def test_two_constants_of_one_value_do_not_share_their_copies():
     first, second = torch.zeros(2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     assert converted(first, torch.zeros(1)) is not converted(second, torch.zeros(1))

@@ -22,6 +22,8 @@ class Backbone(nn.Module, ABC):
     def tables(self, points: Tensor) -> Tables:
         """What depends on the clouds' geometry alone; found once, outside autograd, here or by a data loader.
 
+        A loader's process calls it without the device, so it uses no weights or buffers.
+
         Args:
             points: (B, N, 3) metres, camera frame, in farthest-point-sampling order.
         """

@@ -1,6 +1,5 @@
 """Objects out of a config: what training and evaluation share."""
 
-import os
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -22,6 +21,7 @@ from pnet.parts.base import ParametricPart
 from pnet.parts.choice import KeypointRule
 from pnet.postprocess.pipeline import PoseRecovery
 from pnet.postprocess.vote import MeanVote
+from pnet.scenes.workers import cores
 
 if TYPE_CHECKING:
     from pnet.engine.method import Method, NetworkMethod, Recovery
@@ -78,13 +78,14 @@ def build_data(cfg: DictConfig, parts: Parts) -> SceneDataModule:
         cfg.data.batch_size,
         cfg.trainer.checkpoint_every * cfg.data.batch_size,
         cfg.data.val_every,
-        loader_workers(cfg.data.workers, cfg.trainer.accelerator),
+        loader_workers(cfg.data.workers, cfg.trainer.accelerator, cfg.trainer.devices),
         cfg.seed,
         None if finds_tables_itself(parts.backbone, cfg.trainer.accelerator) else parts.backbone.tables,
         share("data.learn", cfg.data.learn),
         instantiate(cfg.views),
         instantiate(cfg.noise),
         None if cfg.data.clutter is None else share("data.clutter", cfg.data.clutter),
+        device_of(cfg.trainer.accelerator) == "cuda",
     )
 
 
@@ -93,11 +94,11 @@ def finds_tables_itself(backbone: Backbone, accelerator: str) -> bool:
     return backbone.pyramid is not None and device_of(accelerator) == "cuda" and bool(KERNELS["cuda"])
 
 
-def loader_workers(setting: int | None, accelerator: str) -> int:
+def loader_workers(setting: int | None, accelerator: str, devices: int = 1) -> int:
     """Loader processes: as many as set; by default some beside a GPU, none that would share a CPU's cores."""
     if setting is not None:
         return setting
-    return min(os.cpu_count() or 1, 8) if device_of(accelerator) == "cuda" else 0
+    return min(max(cores() // devices, 1), 8) if device_of(accelerator) == "cuda" else 0
 
 
 def open_source(data: DictConfig) -> DataSource:

@@ -21,13 +21,13 @@ def convert(cfg: DictConfig) -> None:
     from rich.console import Console
 
     from pnet.cli.build import open_source
-    from pnet.cli.generate import cores
     from pnet.cli.instantiate import instantiate
     from pnet.data.conversion import conversion_manifest, plan_conversion
     from pnet.data.conversion import convert as convert_all
     from pnet.engine.locks import hold
     from pnet.reporting.progress import count_progress
     from pnet.scenes.protocol import SPLITS
+    from pnet.scenes.workers import cores
 
     if cfg.get("part") is None or cfg.get("data") is None:
         raise ValueError(

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from pnet.engine.callbacks import Throughput
 
 
+NEEDED_ON_CUDA = "Triton, a C compiler (gcc) and Python's headers (python3-dev): install what is missing"
+
+
 def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
     """Train the network; what came out of it, from metrics.json where the run has ended before."""
     import lightning
@@ -32,6 +35,7 @@ def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
     from pnet.engine.tensorboard import add_settings
     from pnet.engine.training import PoseTraining, check_identity
     from pnet.models.summary import summarise
+    from pnet.ops.operators import has_toolkit
     from pnet.scenes.manifest import settings_fingerprint
 
     if cfg.trainer.threads is not None:
@@ -39,6 +43,8 @@ def fit(cfg: DictConfig, run: Path) -> dict[str, Any]:
     device = device_of(cfg.trainer.accelerator)
     if device == "cpu":
         keep_freed_memory()
+    elif not has_toolkit(device):
+        print(f"note: the GPU runs without pnet's kernels, many times slower; they need {NEEDED_ON_CUDA}")
     checkpoint = resume_from(cfg.ckpt, run / "checkpoints" / NAME)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
     precision = Precision.of(cfg.trainer.precision, device)
@@ -95,14 +101,18 @@ def compiled(trainer: DictConfig) -> bool:
     """Whether torch.compile makes the network's code; absent in the settings of earlier runs.
 
     Raises:
-        ValueError: on a CPU without a C++ compiler.
+        ValueError: without what it needs.
     """
     from pnet.cli.build import device_of
+    from pnet.ops.operators import has_toolkit
 
     if not trainer.get("compile"):
         return False
     names = [name for name in (os.environ.get("CXX"), "g++", "clang++", "c++") if name]
-    if device_of(trainer.accelerator) == "cpu" and not any(map(shutil.which, names)):
+    if device_of(trainer.accelerator) == "cuda":
+        if not has_toolkit("cuda"):
+            raise ValueError(f"trainer.compile=true needs {NEEDED_ON_CUDA}, or leave it out")
+    elif not any(map(shutil.which, names)):
         raise ValueError("trainer.compile=true needs a C++ compiler on a CPU: install g++, or leave it out")
     return True
 
@@ -196,10 +206,11 @@ def check_same_settings(run: Path, cfg: DictConfig) -> None:
 def build_trainer(cfg: DictConfig, run: Path, callbacks: list["lightning.Callback"]) -> "lightning.Trainer":
     """The Lightning trainer: an epoch lasts from one checkpoint to the next."""
     import lightning
-    from lightning.pytorch.callbacks import LearningRateMonitor, RichProgressBar
+    from lightning.pytorch.callbacks import LearningRateMonitor
     from lightning.pytorch.loggers import TensorBoardLogger
 
     from pnet.cli.build import device_of
+    from pnet.engine.callbacks import SparingBar
 
     options = cfg.trainer
     on_cpu = device_of(options.accelerator) == "cpu"
@@ -225,8 +236,7 @@ def build_trainer(cfg: DictConfig, run: Path, callbacks: list["lightning.Callbac
         check_val_every_n_epoch=options.validate_every // options.checkpoint_every,
         gradient_clip_val=options.clip,
         logger=TensorBoardLogger(run, name="tensorboard", version="", default_hp_metric=False),
-        # what the bar shows is read back from the device
-        callbacks=[*callbacks, LearningRateMonitor("step"), RichProgressBar(1 if on_cpu else 20)],
+        callbacks=[*callbacks, LearningRateMonitor("step"), SparingBar(1 if on_cpu else 20)],
         log_every_n_steps=min(10, options.checkpoint_every),
         num_sanity_val_steps=0,
         enable_model_summary=False,

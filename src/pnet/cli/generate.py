@@ -1,7 +1,6 @@
 """pnet-generate: make a data set."""
 
 import json
-import os
 from collections import Counter
 from contextlib import nullcontext
 from pathlib import Path
@@ -133,6 +132,7 @@ def make_missing(cfg: DictConfig, plan: "Plan", tasks: list["CycleTask"]) -> Non
     """Make the files that are not there, with a progress bar and a summary."""
     from pnet.reporting.progress import scene_progress
     from pnet.scenes.generation import Summary, generate
+    from pnet.scenes.workers import cores
 
     workers = cores() if cfg.workers is None else cfg.workers
     summary, start = Summary(), perf_counter()
@@ -145,11 +145,6 @@ def make_missing(cfg: DictConfig, plan: "Plan", tasks: list["CycleTask"]) -> Non
             advance(report is not None)
     summary.seconds = perf_counter() - start
     print_summary(plan, summary)
-
-
-def cores() -> int:
-    """How many this process may use: under a job scheduler fewer than the machine has."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def plan_tasks(part: "ParametricPart", protocol: "Protocol") -> list["CycleTask"]:

@@ -8,6 +8,7 @@ from omegaconf import DictConfig
 from rich.table import Table
 
 from pnet.cli.app import config_dir, run_app
+from pnet.cli.fit import NEEDED_ON_CUDA
 
 EXTRAS = ("triton", "mujoco", "hydra-submitit-launcher", "OpenEXR", "h5py")  # beside what provenance names
 
@@ -47,15 +48,19 @@ def devices() -> Iterator[tuple[str, str]]:
     """The processor, and each GPU that torch can use or why there is none."""
     import torch
 
+    from pnet.ops.operators import has_toolkit
+
     bf16 = "bf16 in hardware" if torch.cpu._is_avx512_bf16_supported() else "no bf16 in hardware"
     yield "cpu", f"{os.cpu_count()} cores, {torch.get_num_threads()} threads, {bf16}"
     if not torch.cuda.is_available():
         built = torch.version.cuda
         yield (
             "gpu",
-            f"none found (torch is built for CUDA {built})" if built else "none (a CPU build of torch)",
+            f"none found, torch is built for CUDA {built}" if built else "none (a CPU build of torch)",
         )
         return
+    if not has_toolkit("cuda"):
+        yield "gpu kernels", f"none: they need {NEEDED_ON_CUDA}"
     for i in range(torch.cuda.device_count()):
         card = torch.cuda.get_device_properties(i)
         memory, capability = f"{card.total_memory / 2**30:.0f} GiB", f"{card.major}.{card.minor}"
@@ -65,21 +70,32 @@ def devices() -> Iterator[tuple[str, str]]:
 def caches() -> Iterator[tuple[str, str]]:
     """Where compiled kernels are kept; a folder that is deleted is filled again."""
     import pnet.ops.cpu
+    import pnet.postprocess.cpu
 
-    beside = Path(pnet.ops.cpu.__file__).parent / "__pycache__"
-    home = Path.home()
-    yield "numba's cache", _size(Path(os.environ.get("NUMBA_CACHE_DIR", beside)))
-    yield "triton's cache", _size(Path(os.environ.get("TRITON_CACHE_DIR", home / ".triton" / "cache")))
+    own = os.environ.get("NUMBA_CACHE_DIR", "")
+    beside = [Path(room.__path__[0]) / "__pycache__" for room in (pnet.ops.cpu, pnet.postprocess.cpu)]
+    for folder in [Path(own)] if own else beside:
+        yield f"numba's cache, {folder.parent.parent.name}", _size(folder)
+    home = Path.home() / ".triton" / "cache"
+    yield "triton's cache", _size(Path(os.environ.get("TRITON_CACHE_DIR", home)))
 
 
 def kernel_table() -> Table:
-    """What runs each operator on each device: a compiled kernel, or the reference in plain torch."""
+    """What runs each operator and each step on each device: a compiled kernel, or plain torch."""
+    import torch
+
+    import pnet.postprocess.pipeline  # noqa: F401  its steps register
     from pnet.ops import gathering, grouping, neighbours, sampling  # noqa: F401  they register
     from pnet.ops.operators import KERNELS, OPERATORS, TOOLKITS
+    from pnet.postprocess.kernels import STEPS
 
-    table = Table("operator", *KERNELS, title="kernels (ops=reference runs none of them)")
+    titles = {"cpu": "cpu", "cuda": "cuda" if torch.cuda.is_available() else "cuda (no card here)"}
+    table = Table("operator or step", *titles.values(), title="kernels (ops=reference runs none of them)")
     for name in OPERATORS:
-        table.add_row(name, *(TOOLKITS[d] if name in KERNELS[d] else "reference" for d in KERNELS))
+        table.add_row(name, *(TOOLKITS[d] if name in KERNELS[d] else "plain torch" for d in titles))
+    for name, known in STEPS.items():
+        served = {kernels.value for kernels in known}
+        table.add_row(name, *(TOOLKITS[d] if d in served and KERNELS[d] else "plain torch" for d in titles))
     return table
 
 

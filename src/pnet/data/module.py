@@ -53,6 +53,7 @@ class SceneDataModule(lightning.LightningDataModule):
         batch_size: scenes. draws: scenes of an epoch; None: each once.
         val_every: keep every so many validation scenes. workers: loader processes. seed: of order and chance.
         tables: finds the backbone's tables of clouds (B, N, 3) in the loaders; None: the network does.
+        pinned: batches in page-locked memory, for a GPU.
         views: where the training's scenes come from; None: the stored ones. noise: added to them; None: none.
         clutter: share of clutter scenes among those that a training draws; None: as many as there are.
         learn: share of the training's part objects that are learnt, spread over the grid, in (0, 1] (the
@@ -76,6 +77,7 @@ class SceneDataModule(lightning.LightningDataModule):
         views: Views | None = None,
         noise: SensorNoise | None = None,
         clutter: float | None = None,
+        pinned: bool = False,
     ) -> None:
         super().__init__()
         if not 0 < learn <= 1:
@@ -87,7 +89,7 @@ class SceneDataModule(lightning.LightningDataModule):
         self.part, self.source, self.targets, self.points = part, source, targets, points
         self._augmentation, self._batch_size, self._draws = augmentation, batch_size, draws
         self._val_every, self._workers, self._seed = val_every, workers, seed
-        self._tables, self._learn = tables, learn
+        self._tables, self._learn, self._pinned = tables, learn, pinned
         self._views, self._noise, self._clutter = views or StoredViews(), noise or NoNoise(), clutter
 
     def scenes(self, split: str, every: int = 1) -> SceneSet:
@@ -158,7 +160,7 @@ class SceneDataModule(lightning.LightningDataModule):
             drop_last=drop_last,
             num_workers=self._workers,
             persistent_workers=self._workers > 0,
-            pin_memory=torch.cuda.is_available(),
+            pin_memory=self._pinned,
             collate_fn=Collate(self._tables),
             generator=torch.Generator().manual_seed(self._seed),
         )

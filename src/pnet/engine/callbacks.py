@@ -5,6 +5,7 @@ from time import perf_counter
 
 import lightning
 import torch
+from lightning.pytorch.callbacks import RichProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from pnet.engine.evaluation import SceneScorer
@@ -44,7 +45,7 @@ class PoseValidation(lightning.Callback):
         for index in range(len(self._scenes)):
             scene = self._scenes[index]
             cloud = torch.from_numpy(scene.points[: self._points])
-            found = self._estimator.estimate(cloud[None].to(pl_module.device))[0]
+            found = self._estimator.estimate(cloud[None])[0]
             scorer.add(scene, found)
             sizes.append(scene.parameters[0] if len(scene.parameters) else None)
             if fullest is None or len(scene.R) > len(fullest[0].R):
@@ -57,6 +58,25 @@ class PoseValidation(lightning.Callback):
             if fullest and self._mesh_every and self._validations % self._mesh_every == 0:
                 add_mesh(writer, self._estimator.part, *fullest, trainer.global_step)
         self._validations += 1
+
+
+class SparingBar(RichProgressBar):
+    """Lightning's, which reads the losses back from the device only where it draws them."""
+
+    SHOWN = ("train/loss", "train/scenes_per_second", "val/loss")
+
+    def __init__(self, refresh_rate: int) -> None:
+        super().__init__(refresh_rate)
+        self._shown: dict[str, int | str | float | dict[str, float]] = {}
+
+    def get_metrics(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> dict[str, int | str | float | dict[str, float]]:
+        """What stands beside the bar: numbers of the last time that it was drawn."""
+        if trainer.global_step % self.refresh_rate == 0:
+            known = trainer.callback_metrics
+            self._shown = {name: f"{float(known[name]):.3f}" for name in self.SHOWN if name in known}
+        return self._shown
 
 
 class Throughput(lightning.Callback):
@@ -105,7 +125,7 @@ class Throughput(lightning.Callback):
         # a logged number goes to the device, and waits for it
         if trainer.global_step % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             scenes, seconds = self.scenes - self._logged[0], self.seconds - self._logged[1]
-            pl_module.log("train/scenes_per_second", scenes / max(seconds, 1e-9), prog_bar=True)
+            pl_module.log("train/scenes_per_second", scenes / max(seconds, 1e-9))
             self._logged = self.scenes, self.seconds
 
     def on_validation_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:

@@ -15,13 +15,14 @@ class Precision(StrEnum):
     BF16 = "bf16"  # autocast: inputs and results of products rounded to seven bits
 
     @classmethod
-    def of(cls, setting: str, device: str) -> "Precision":
+    def of(cls, setting: str | int, device: str) -> "Precision":
         """The precision of a setting.
 
         Args:
             setting: one of the names, or "auto": bf16 where the device multiplies it in hardware, else 32.
             device: "cuda" or "cpu".
         """
+        setting = str(setting)  # 32 comes as a number from the command line
         if setting == "auto":
             return cls.BF16 if _multiplies_bf16(device) else cls.FLOAT32
         if setting not in list(cls):
@@ -37,13 +38,15 @@ class Precision(StrEnum):
     @contextmanager
     def numbers(self, device: str) -> Iterator[None]:
         """For a network's forward pass; what was set for the process before comes back."""
-        before = torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
-        self.set_products(device)
-        try:
-            with torch.autocast(device, torch.bfloat16, enabled=self is Precision.BF16):
+        with torch.autocast(device, torch.bfloat16, enabled=self is Precision.BF16):
+            if device != "cuda":
                 yield
-        finally:
-            if device == "cuda":
+                return
+            before = torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
+            self.set_products(device)
+            try:
+                yield
+            finally:
                 torch.set_float32_matmul_precision(before[0])
                 torch.backends.cudnn.allow_tf32 = before[1]
 

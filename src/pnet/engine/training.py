@@ -90,7 +90,7 @@ class PoseTraining(lightning.LightningModule):
     def _log(self, stage: str, losses: dict[str, Tensor], size: int) -> None:
         for name, value in losses.items():
             group = f"{stage}/loss" if name == "loss" else f"{stage}_loss/{name}"
-            self.log(group, value, prog_bar=name == "loss", batch_size=size)
+            self.log(group, value, batch_size=size)
 
 
 def check_identity(checkpoint: dict[str, Any], expected: dict[str, str]) -> None:

@@ -19,5 +19,6 @@ def converted(constant: Tensor, like: Tensor) -> Tensor:
     copies: dict[Kind, Tensor] = constant.__dict__.setdefault("converted", {})
     kind = like.dtype, like.device
     if kind not in copies:
-        copies[kind] = constant.to(like)
+        with torch.inference_mode(False):  # a copy made there could not serve a training later
+            copies[kind] = constant.to(dtype=like.dtype, device=like.device)
     return copies[kind]

@@ -5,9 +5,14 @@ The function under `@operator` is its plain torch reference and runs on any devi
 device registers beside it (`@kernel(operator, "cpu")`, "cuda") and is imported at its first use.
 """
 
+import os
+import shutil
+import sysconfig
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from functools import cache
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
 
 import torch
@@ -44,14 +49,10 @@ def operator(reference: Callable[..., object]) -> Operator:
 
 
 def kernel(made: Operator, device: str) -> Callable[[Function], Function]:
-    """Register a device's kernel of an operator.
-
-    Where the toolkit that compiles it is not installed (Triton comes with CUDA builds of torch for Linux, not
-    with others) the reference goes on to serve that device.
-    """
+    """Register a device's kernel of an operator; without its toolkit the reference goes on to serve it."""
 
     def register(function: Function) -> Function:
-        if find_spec(TOOLKITS[device]) is None:
+        if not has_toolkit(device):
             return function
         KERNELS[device].append(next(name for name, known in OPERATORS.items() if known is made))
         return made.register_kernel(device)(function)
@@ -59,9 +60,25 @@ def kernel(made: Operator, device: str) -> Callable[[Function], Function]:
     return register
 
 
+@cache
+def has_toolkit(device: str) -> bool:
+    """Whether a device's kernels can be compiled.
+
+    Triton comes with CUDA builds of torch for Linux, not with others. It builds its launcher with a C
+    compiler and Python's headers, which a slim container lacks.
+    """
+    if find_spec(TOOLKITS[device]) is None:
+        return False
+    compilers = (os.environ.get("CC") or "gcc", "clang")
+    header = Path(sysconfig.get_paths()["include"]) / "Python.h"
+    return device != "cuda" or (header.is_file() and any(map(shutil.which, compilers)))
+
+
 @contextmanager
 def plain_operators() -> Iterator[None]:
     """Run the references instead of the kernels, in this whole process: to compare, or to find a fault."""
+    from pnet.ops import gathering, grouping, neighbours, sampling  # noqa: F401  they register
+
     with ExitStack() as stack:
         for device, names in KERNELS.items():
             for name in names:

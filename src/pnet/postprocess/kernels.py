@@ -7,12 +7,13 @@ A step is a plain torch function under `@step`. A kernel has its name and its ar
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import Enum
-from functools import cache, wraps
+from functools import wraps
 from importlib import import_module
-from importlib.util import find_spec
 from typing import Any, TypeVar, cast
 
 from torch import Tensor
+
+from pnet.ops.operators import has_toolkit
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -25,6 +26,7 @@ class Kernels(Enum):
     PLAIN = ""
 
 
+STEPS: dict[str, tuple[Kernels, ...]] = {}  # which kernels each step has
 _forced: list[Kernels] = []  # the last one counts
 
 
@@ -35,7 +37,7 @@ def kernels_for(tensor: Tensor) -> Kernels:
     match tensor.device.type:
         case "cpu":
             return Kernels.NUMBA
-        case "cuda" if _has_triton():
+        case "cuda" if has_toolkit("cuda"):
             return Kernels.TRITON
     return Kernels.PLAIN
 
@@ -58,6 +60,8 @@ def step(module: str, *known: Kernels) -> Callable[[Function], Function]:
     """
 
     def decorate(plain: Function) -> Function:
+        STEPS[plain.__name__] = known
+
         @wraps(plain)
         def run(tensor: Tensor, *args: Any) -> object:
             kernels = kernels_for(tensor)
@@ -69,9 +73,3 @@ def step(module: str, *known: Kernels) -> Callable[[Function], Function]:
         return cast(Function, run)
 
     return decorate
-
-
-@cache
-def _has_triton() -> bool:
-    """It comes with CUDA builds of torch for Linux, not with others."""
-    return find_spec("triton") is not None

@@ -22,6 +22,11 @@ class Work(Protocol[Task, Report]):
         """Make the files of one task."""
 
 
+def cores() -> int:
+    """How many this process may use: under a job scheduler fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def in_parallel(
     work: Work[Task, Report], tasks: Iterable[Task], workers: int, roots: Sequence[Path]
 ) -> Iterator[Report]:

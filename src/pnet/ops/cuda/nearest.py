@@ -3,6 +3,7 @@
 A thread has a query of its own and sees one point after another, in rising number and at the same time as
 its neighbours: one load serves the warp, nothing is exchanged, and of equally near points the first stays in
 front by itself. Four are kept in registers; where more are asked for, the next pass takes those behind them.
+Squared distances must be finite numbers: what overflows is not found.
 """
 
 import torch

@@ -53,7 +53,7 @@ def _octants(
     group_high += b * (3 * GROUPS)
     me = tl.load(number + slot)
     x, y, z = coordinates(place + slot, SLOTS)
-    # blocks have two axes everywhere, octants and candidates: so nothing has to change hands between threads
+    # blocks have two axes everywhere, octants and candidates: so none has to be laid out anew
     best = tl.full((8, 1), 0, tl.int32) + sortable(tl.where(me < n, tl.load(limit), -1.0))  # a copy: nothing
     who = tl.full((8, 1), 0, tl.int32) + n
     own = slot // SIZE

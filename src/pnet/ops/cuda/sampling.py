@@ -95,6 +95,7 @@ def _visit(place, number, gap, bucket, chosen, x, y, z, n, SLOTS: tl.constexpr, 
     px, py, pz = coordinates(place + slot, SLOTS)
     who = tl.load(number + slot)
     dx, dy, dz = px - x, py - y, pz - z
+    # with several warps one may load what another has stored just now; the minimum is the same then
     left = tl.minimum(tl.load(gap + slot), dx * dx + dy * dy + dz * dz)
     left = tl.where(who == chosen, -1.0, left)  # not chosen again, not even where points coincide
     tl.store(gap + slot, left)

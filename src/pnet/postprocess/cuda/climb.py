@@ -56,7 +56,7 @@ def nearest_mode(points: Tensor, modes: Tensor, number: Tensor, bandwidth: float
     if labels.numel():
         with on_device_of(points):
             _nearest_mode[triton.cdiv(n, size), B](
-                points.contiguous(), modes.contiguous(), number, labels,
+                points.contiguous(), modes.contiguous(), number.contiguous(), labels,
                 _numbers(points, bandwidth * bandwidth), n, modes.shape[1], POINTS=size, **EXACT,
             )  # fmt: skip
     return labels

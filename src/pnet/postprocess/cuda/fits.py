@@ -18,7 +18,8 @@ SWEEPS = tl.constexpr(20)  # of Jacobi's method, which needs some five
 def fit_rigid_many(source: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """See `pnet.postprocess.fit`."""
     shape, n = target.shape[:-2], target.shape[-2]
-    flat = [x.reshape(-1, *x.shape[len(shape) :]).contiguous() for x in (source, target, weight)]
+    whole = source.expand_as(target), target, weight.expand(target.shape[:-1])
+    flat = [x.reshape(-1, *x.shape[len(shape) :]).contiguous() for x in whole]
     R, t = target.new_empty(*shape, 3, 3), target.new_empty(*shape, 3)
     fits = shape.numel()
     if fits:

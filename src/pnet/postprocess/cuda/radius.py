@@ -24,7 +24,8 @@ def neighboured(votes: Tensor, groups: Groups, done: Tensor, neighbours: int, ra
     if near.numel():
         with on_device_of(votes):
             _neighboured[triton.cdiv(m, size), q](
-                votes.contiguous(), groups.owner, groups.size, groups.size.cumsum(0), done.contiguous(), near,
+                votes.contiguous(), groups.owner.contiguous(), groups.size.contiguous(),
+                groups.size.cumsum(0), done.contiguous(), near,
                 votes.new_full((1,), radius * radius), m, q, neighbours,
                 VOTES=size, AT_ONCE=AT_ONCE, **EXACT,
             )  # fmt: skip
