@@ -1,14 +1,16 @@
 """The operators as torch sees them, and the checks that all of them share."""
 
 import math
+import shutil
 import subprocess
 import sys
+import sysconfig
 
 import numpy as np
 import pytest
 import torch
 
-from pnet.ops import neighbours, sampling
+from pnet.ops import neighbours, operators, sampling
 from pnet.ops.gathering import gather_max, gather_rows, gather_sum
 from pnet.ops.grouping import group_max
 from pnet.ops.neighbours import ball_query, nearest, octants, three_nearest
@@ -85,6 +87,24 @@ def test_plain_operators_run_no_kernel_and_hand_them_back(monkeypatch):
         raise ZeroDivisionError
     with pytest.raises(LookupError):
         octants(POINTS, 0.1)
+
+
+def test_kernels_for_cuda_need_triton_a_compiler_and_pythons_headers(monkeypatch, tmp_path):
+    has_toolkit = operators.has_toolkit.__wrapped__  # without its memory
+    (tmp_path / "Python.h").touch()
+    monkeypatch.setattr(operators, "find_spec", lambda name: name)
+    monkeypatch.setattr(sysconfig, "get_paths", lambda: {"include": str(tmp_path)})
+    monkeypatch.setattr(shutil, "which", lambda name: "/usr/bin/gcc" if name == "gcc" else None)
+    monkeypatch.delenv("CC", raising=False)
+    assert has_toolkit("cuda") and has_toolkit("cpu")
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert not has_toolkit("cuda") and has_toolkit("cpu")
+    monkeypatch.delenv("CC")
+    (tmp_path / "Python.h").unlink()
+    assert not has_toolkit("cuda")
+    (tmp_path / "Python.h").touch()
+    monkeypatch.setattr(operators, "find_spec", lambda name: None)
+    assert not has_toolkit("cuda") and not has_toolkit("cpu")
 
 
 def test_a_radius_is_squared_in_the_precision_of_the_points():

@@ -18,7 +18,7 @@ def on(device: str) -> SimpleNamespace:
 def test_each_device_has_its_own(monkeypatch):
     assert kernels_for(torch.zeros(1)) is Kernels.NUMBA and kernels_for(on("mps")) is Kernels.PLAIN
     for installed, expected in ((True, Kernels.TRITON), (False, Kernels.PLAIN)):
-        monkeypatch.setattr(kernels, "_has_triton", lambda installed=installed: installed)
+        monkeypatch.setattr(kernels, "has_toolkit", lambda device, installed=installed: installed)
         assert kernels_for(on("cuda")) is expected
 
 
