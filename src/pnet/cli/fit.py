@@ -108,11 +108,10 @@ def compiled(trainer: DictConfig) -> bool:
 
     if not trainer.get("compile"):
         return False
-    names = [name for name in (os.environ.get("CXX"), "g++", "clang++", "c++") if name]
     if device_of(trainer.accelerator) == "cuda":
         if not has_toolkit("cuda"):
             raise ValueError(f"trainer.compile=true needs {NEEDED_ON_CUDA}, or leave it out")
-    elif not any(map(shutil.which, names)):
+    elif not any(map(shutil.which, (os.environ.get("CXX") or "g++", "g++", "clang++", "c++"))):
         raise ValueError("trainer.compile=true needs a C++ compiler on a CPU: install g++, or leave it out")
     return True
 

@@ -20,22 +20,15 @@ def main() -> None:
 
 def info(cfg: DictConfig) -> None:
     """Print what results, and their speed, depend on."""
-    from importlib.metadata import PackageNotFoundError, version
-
     from rich.console import Console
 
-    from pnet.engine.provenance import provenance
+    from pnet.engine.provenance import package_versions, provenance
 
     table = Table(show_header=False)
     state = provenance(seed=0)
-    packages = state.pop("packages")
+    packages = {**state.pop("packages"), **package_versions(EXTRAS)}
     for key in ("seed", "device"):
         state.pop(key)
-    for name in EXTRAS:
-        try:
-            packages[name] = version(name)
-        except PackageNotFoundError:
-            packages[name] = "absent"
     rows = {**state, "configs": config_dir(), **dict(devices()), **dict(caches()), **packages}
     for name, value in rows.items():
         table.add_row(str(name), str(value))
@@ -48,10 +41,11 @@ def devices() -> Iterator[tuple[str, str]]:
     """The processor, and each GPU that torch can use or why there is none."""
     import torch
 
+    from pnet.engine.precision import Precision
     from pnet.ops.operators import has_toolkit
 
-    bf16 = "bf16 in hardware" if torch.cpu._is_avx512_bf16_supported() else "no bf16 in hardware"
-    yield "cpu", f"{os.cpu_count()} cores, {torch.get_num_threads()} threads, {bf16}"
+    bf16 = "bf16" if Precision.of("auto", "cpu") is Precision.BF16 else "no bf16"
+    yield "cpu", f"{os.cpu_count()} cores, {torch.get_num_threads()} threads, {bf16} in hardware"
     if not torch.cuda.is_available():
         built = torch.version.cuda
         yield (
@@ -85,13 +79,12 @@ def kernel_table() -> Table:
     import torch
 
     import pnet.postprocess.pipeline  # noqa: F401  its steps register
-    from pnet.ops import gathering, grouping, neighbours, sampling  # noqa: F401  they register
-    from pnet.ops.operators import KERNELS, OPERATORS, TOOLKITS
+    from pnet.ops.operators import KERNELS, TOOLKITS, all_operators
     from pnet.postprocess.kernels import STEPS
 
     titles = {"cpu": "cpu", "cuda": "cuda" if torch.cuda.is_available() else "cuda (no card here)"}
     table = Table("operator or step", *titles.values(), title="kernels (ops=reference runs none of them)")
-    for name in OPERATORS:
+    for name in all_operators():
         table.add_row(name, *(TOOLKITS[d] if name in KERNELS[d] else "plain torch" for d in titles))
     for name, known in STEPS.items():
         served = {kernels.value for kernels in known}

@@ -3,6 +3,7 @@
 import json
 import platform
 import subprocess
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -49,10 +50,10 @@ def commit_text(git: dict[str, Any]) -> str:
     return str(git.get("commit", "unknown"))[:7] + ("+changes" if git.get("changed") else "")
 
 
-def package_versions() -> dict[str, str]:
-    """Installed versions of what a result depends on; "absent" where one is missing."""
+def package_versions(names: Sequence[str] = PACKAGES) -> dict[str, str]:
+    """Installed versions, of what a result depends on; "absent" where one is missing."""
     found = {}
-    for name in PACKAGES:
+    for name in names:
         try:
             found[name] = version(name)
         except PackageNotFoundError:

@@ -74,15 +74,21 @@ def has_toolkit(device: str) -> bool:
     return device != "cuda" or (header.is_file() and any(map(shutil.which, compilers)))
 
 
+def all_operators() -> dict[str, Operator]:
+    """Every operator by its name; their modules register them, and their kernels, when they are imported."""
+    from pnet.ops import gathering, grouping, neighbours, sampling  # noqa: F401
+
+    return OPERATORS
+
+
 @contextmanager
 def plain_operators() -> Iterator[None]:
     """Run the references instead of the kernels, in this whole process: to compare, or to find a fault."""
-    from pnet.ops import gathering, grouping, neighbours, sampling  # noqa: F401  they register
-
+    operators = all_operators()
     with ExitStack() as stack:
         for device, names in KERNELS.items():
             for name in names:
-                stack.enter_context(OPERATORS[name].set_kernel_enabled(device, enabled=False))
+                stack.enter_context(operators[name].set_kernel_enabled(device, enabled=False))
         yield
 
 
