@@ -85,6 +85,8 @@ class Batch:
         rotation: (B, N, 3, 3) label: rotation of the instance, part → camera; None where no method asks.
         scale: (B, 3, 3) Λ of each scene's part object in the part frame, metres (λ times the identity for a
             revolution), by which rotations are compared; None likewise.
+        lookalike: (B, N) int64 which exchange of keypoints each point was taught, see
+            `KeypointChain.exchanged`; None where there is none.
     """
 
     points: Tensor
@@ -97,6 +99,7 @@ class Batch:
     tables: dict[str, Tensor] | None = None
     rotation: Tensor | None = None
     scale: Tensor | None = None
+    lookalike: Tensor | None = None
 
     def pin_memory(self) -> "Batch":
         """A copy in page-locked memory, for asynchronous transfer; the loader calls it."""
@@ -132,11 +135,17 @@ class PointPrediction:
         centroid: (B, N, 3) metres, camera frame.
         keypoints: (B, N, m, 3) metres, camera frame.
         visibility: (B, N) in [0, 1], or None without M_V.
+        doubt: (B, N, 1 + m + k) by how much the point expects its centroid, each keypoint and each parameter
+            to be off, metres; None where the network has no such head.
+        parameters: (B, N, k) the parameters of the point's part object, metres; None where they are measured
+            between its keypoints alone, as in the paper.
     """
 
     centroid: Tensor
     keypoints: Tensor
     visibility: Tensor | None
+    doubt: Tensor | None = None
+    parameters: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)

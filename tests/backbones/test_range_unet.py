@@ -138,3 +138,26 @@ def test_one_point_is_enough():
 def test_sizes_that_make_no_grid_are_refused(changes):
     with pytest.raises(ValueError, match="at least two levels and positive cell, depth, depth_scale"):
         build(**changes)
+
+
+def test_slopes_widen_the_first_layer_and_change_nothing_else():
+    plain, seeing = ({k: tuple(v.shape) for k, v in build(slopes=s).state_dict().items()} for s in (None, 2))
+    assert plain.keys() == seeing.keys()
+    (wider,) = (name for name in plain if plain[name] != seeing[name])
+    assert wider == next(iter(plain))
+    assert plain[wider] == (8, 4, 3, 3) and seeing[wider] == (8, 7, 3, 3)
+
+
+def test_what_the_slopes_say_reaches_the_first_layer():
+    """With the weights of the image alone the network is the one without slopes; with others it is not."""
+    plain, seeing = build().eval(), build(slopes=2).eval()
+    weights = dict(plain.state_dict())
+    first = next(iter(weights))
+    blind = torch.cat([weights[first], torch.zeros(8, 3, 3, 3)], 1)
+    seeing.load_state_dict({**weights, first: blind})
+    points = clouds()
+    torch.testing.assert_close(features(seeing, points), features(plain, points), rtol=0, atol=1e-5)
+    seeing.load_state_dict({**weights, first: blind + 0.1})
+    without = {**weights, first: weights[first] + 0.1}
+    plain.load_state_dict(without)
+    assert float((features(seeing, points) - features(plain, points)).detach().abs().max()) > 1e-3

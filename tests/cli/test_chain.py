@@ -27,7 +27,8 @@ def refinement():
 
 def written(folder, table, ending):
     """A table's file: the overrides of the sweep stand in its name."""
-    (path,) = folder.glob(f"table_{table.number}_smoke_*.{ending}")
+    paths = folder.glob(f"table_{table.number}_smoke_*.{ending}")
+    (path,) = (path for path in paths if not path.stem.endswith(("_curves", "_errors")))
     return path
 
 
@@ -78,6 +79,7 @@ def test_one_sweep_fills_every_table_of_the_paper(bullet, refinement, tmp_path, 
         assert_every_cell_was_measured(tables, table)
         assert_printed_beside_the_published_figures(tables, table)
         assert written(tables, table, "png").read_bytes().startswith(b"\x89PNG")
+        assert len(list(tables.glob(f"table_{table.number}_smoke_*_curves.png"))) == 1
 
     again = run_process(tmp_path, "train", "--multirun", "sweep=all", *TINY)
     assert again.code == 0 and "44 jobs: 44 done, 0 missing; nothing to do" in again.out, again

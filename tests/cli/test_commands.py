@@ -133,7 +133,8 @@ def test_tensorboard_holds_what_is_watched(smoke):
 def test_evaluation_leaves_predictions_curve_and_metrics(smoke):
     folder = smoke.run / "evaluation" / "test_l"
     metrics, curve = (json.loads((folder / name).read_text()) for name in ("metrics.json", "curve.json"))
-    assert set(metrics) == METRICS | {"predictions"} and metrics["scenes"] == 3
+    each = {"parameter_error_mm/r", "parameter_error_mm/h"}  # where anything was found
+    assert set(metrics) - each == METRICS | {"predictions"} and metrics["scenes"] == 3
     assert (
         curve["recall"][0] == 0
         and curve["precision"][0] == 1

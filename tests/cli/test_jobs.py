@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf, open_dict
 
 from pnet.cli.app import LONGEST_NAME, config_dir, hydra_value, short_name
+from pnet.cli.build import build_parts
 from pnet.cli.evaluate import Evaluation, recovery_settings, wanted_evaluations
 from pnet.cli.jobs import cell_evaluation, changed, composed, expand, making, plain_jobs, sweep_jobs
 from pnet.cli.runs import RunIndex, read_metrics
@@ -637,3 +638,34 @@ def test_a_name_of_the_longest_length_is_kept():
     assert short_name("a" * 120) == "a" * 120
     assert short_name("a" * 121) == f"{'a' * 111}-{short_name('a' * 121)[-8:]}"
     assert short_name("data.learn-1/3_x-[1, 2]") == "data.learn-1-3_x-1+2"
+
+
+@pytest.mark.parametrize(("head", "word"), [("sizes", "loss.sizes=0"), ("doubt", "loss.doubt=0.0")])
+def test_a_head_that_nothing_teaches_is_refused(head, word):
+    with pytest.raises(ValueError, match=rf"model\.{head} is true and loss\.{head} is 0"):
+        build_parts(resolved("part=tn34", "protocol=smoke", "recipe=small", word))
+
+
+@pytest.mark.parametrize("loss", ["paper", "released", "each"])
+def test_every_parametric_loss_teaches_the_heads_of_a_compact_network(loss):
+    cfg = resolved("part=tn34", "protocol=smoke", "recipe=small", f"loss={loss}")
+    assert cfg.model.sizes and cfg.model.doubt and cfg.loss.sizes > 0 and cfg.loss.doubt > 0
+
+
+@pytest.mark.parametrize(
+    ("word", "exchanged"),
+    [("ablation=none", True), ("ablation=no_gu", False), ("ablation=rule_camera", False)],
+)
+def test_lookalikes_are_sought_only_where_they_were_taught(word, exchanged):
+    recovery = build_parts(resolved("part=tn42", "protocol=smoke", "recipe=small", word)).recovery
+    assert recovery.voting.lookalikes is exchanged
+
+
+def test_runs_of_before_a_head_was_there_are_found():
+    now = resolved("part=tn34", "protocol=smoke", "experiment=paper")
+    before = OmegaConf.to_container(now)
+    for group, key in (("model", "sizes"), ("model", "doubt"), ("model", "pooling"), ("loss", "sizes")):
+        del before[group][key]
+    assert training_settings(before) == training_settings(now)
+    with_pooling = resolved("part=tn34", "protocol=smoke", "experiment=paper", "model.pooling=0.006")
+    assert training_settings(with_pooling) != training_settings(now)

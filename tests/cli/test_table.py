@@ -8,6 +8,7 @@ import pytest
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf, open_dict
+from torch.utils.tensorboard import SummaryWriter
 
 from pnet.cli.runs import RunIndex
 from pnet.cli.sweep_file import Heading, TablePlan, read_sweep
@@ -347,6 +348,30 @@ def test_the_command_writes_what_it_prints(run_here, tmp_path):
     assert (
         "V,smoke part=tn34,ParametricNet,,TN34,mAP on the G-dataset" in text and ",0.5,,1,1.0,-0.5\n" in text
     )
+
+
+def test_the_command_writes_errors_and_learning_curves_beside_the_table(run_here, tmp_path):
+    """Of two seeds, one without TensorBoard files."""
+    scores = {"mAP": 0.5, "data": "d1", "parameter_error_mm": 0.3, "position_error_mm": 1.0}
+    scores |= {"parameter_error_mm/h": 0.4, "parameter_error_mm/r": 0.2, "axis_error_deg": 2.0}
+    for seed in (0, 1):
+        run = write_run(f"run_{seed}", f"seed={seed}", evaluations={FULL: scores})
+    with SummaryWriter(RUNS / "run_0" / "tensorboard") as writer:
+        writer.add_scalar("val/mAP", 0.25, 3)
+    shutil.move("outputs/train", "moved")
+    outcome = run_here(tmp_path, "table", "table=5", "protocol=smoke", "runs=moved", "output=to", "part=tn34")
+    assert outcome.code == 0, outcome
+    stem = tmp_path / "to" / "table_V_smoke_part-tn34"
+    assert (
+        "| ParametricNet / TN34 | 0.500 | 0.30 | r 0.20, h 0.40 | 1.00 | 2.00 |"
+        in Path(f"{stem}.md").read_text()
+    )
+    assert "Table V: Parameter errors, mm" in outcome.out
+    lines = Path(f"{stem}_errors.csv").read_text().splitlines()
+    assert [line.split(",")[-5:] for line in lines[1:]] == [["0.3", "0.2", "0.4", "1.0", "2.0"]] * 2
+    assert Path(f"{stem}_curves.png").read_bytes().startswith(b"\x89PNG")
+    assert f"· {Path('moved', run.name)}: no val/mAP in TensorBoard files" in outcome.out
+    assert ".md, .csv, .tex, _errors.csv, .png, _curves.png" in outcome.out
 
 
 def test_a_table_without_runs_says_how_to_make_them(run_here, tmp_path):

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.conftest import load_part
 
 from pnet.data.targets import instance_keypoints, nearest_keypoints, point_labels
 from pnet.parts.choice import KeypointChoice, KeypointRule
@@ -103,8 +104,8 @@ def test_camera_what_hangs_on_a_chosen_end_follows_it(tn16, one_body):
 
 
 def test_camera_a_mirror_pair_differs_by_its_distance_in_depth(tn42, one_body):
-    foot, side, toe, head = camera_margin(tn42, one_body(tn42, (36, 13, 11), 50))
-    assert foot == toe == head == INF
+    foot, side, toe, head, tip = camera_margin(tn42, one_body(tn42, (36, 13, 11), 50))
+    assert foot == toe == head == tip == INF
     assert side == pytest.approx(11 * math.sin(math.radians(50)), abs=1e-9)
 
 
@@ -135,13 +136,30 @@ def test_point_distances_of_a_nut(tn06, one_body):
 
 
 def test_point_distances_of_a_bars_sides(tn42, one_body):
-    foot, side, toe, head = point_margin(tn42, one_body(tn42, (36, 13, 11), 25, [(0, 5.5, 0)]))[0]
-    assert foot == toe == head == INF
+    """Of the corners, which it might be taken for, foot is nearest to the side's middle, head is next."""
+    foot, side, toe, head, tip = point_margin(tn42, one_body(tn42, (36, 13, 11), 25, [(0, 5.5, 0)]))[0]
+    x, z = 36 / 3 * 25 / 19, (13**2 + 13 * 6 + 6**2) / 57  # the centroid, from the foot
+    lead = math.hypot(x, 5.5, 13 - z) - math.hypot(x, 5.5, z)
+    assert [foot, toe, head, tip] == pytest.approx([lead] * 4, abs=1e-3)
     assert side == pytest.approx(11, abs=1e-3)
 
 
+def test_point_labels_halfway_between_the_ends_are_a_tie(tn42, one_body):
+    """A point of the lower face, as far from foot as from toe; then 3 mm nearer to the foot."""
+    x, z = 36 / 3 * 25 / 19, (13**2 + 13 * 6 + 6**2) / 57
+    scene = one_body(tn42, (36, 13, 11), 65, [(18 - x, 2, -z), (15 - x, 2, -z)])
+    tie, beside = point_margin(tn42, scene)
+    assert [tie[i] for i in (0, 2, 3, 4)] == pytest.approx([0] * 4, abs=1e-3)
+    lead = math.hypot(15, 2, 13) - math.hypot(15, 2)  # head comes next
+    assert [beside[i] for i in (0, 2, 3, 4)] == pytest.approx([lead] * 4, abs=1e-3)
+    for (_, side, *_), along in ((tie, 18 - x), (beside, 15 - x)):
+        assert side == pytest.approx(math.hypot(along, 7.5, z) - math.hypot(along, 3.5, z), abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["tn06", "tn34", "tn42"])
 @pytest.mark.parametrize("choice", [CAMERA, POINT], ids=["camera", "point"])
-def test_a_keypoint_is_no_surer_than_what_it_hangs_on(part, make_scene, choice):
+def test_a_keypoint_is_no_surer_than_what_it_hangs_on(name, make_scene, choice):
+    part = load_part(name)
     margin = point_labels(make_scene(part, bodies=20, points=300), part.chain, choice)["margin"]
     assert float(margin.min()) >= 0
     for i, reference in enumerate(part.chain.reference):

@@ -161,8 +161,18 @@ def candidates(part, size: np.ndarray, chosen: dict[str, np.ndarray]) -> dict[st
         "foot": -below[None],
         "toe": (length * x - below)[None],
         "head": (a * z - below)[None],
+        "tip": (length * x + 0.006 * z - below)[None],
         "side": np.outer([w / 2, -w / 2], y),
     }
+
+
+# tn42: the corner nearest to a point → which keypoint's place each keypoint is taught, else its own
+EXCHANGES = {
+    "foot": {},
+    "toe": {"foot": "toe", "toe": "foot", "head": "tip", "tip": "head"},
+    "head": {"foot": "head", "head": "foot", "toe": "tip", "tip": "toe"},
+    "tip": {"foot": "tip", "tip": "foot", "toe": "head", "head": "toe"},
+}
 
 
 @pytest.fixture(params=["tn06", "tn34", "tn16", "tn42"])
@@ -193,16 +203,40 @@ def test_gu_labels_of_sixty_bodies_are_those_of_trying_every_place(pile):
 
 def test_point_labels_of_sixty_bodies_are_those_of_trying_every_place(pile):
     part, scene = pile
-    labels = point_labels(scene, part.chain, POINT)["keypoints"].double().numpy()
+    said = point_labels(scene, part.chain, POINT)
+    labels, which, seen = said["keypoints"].double().numpy(), said.get("lookalike"), set()
+    assert (which is not None) == (part.name == "tn42")
     for n, i in enumerate(scene.instance):
         local = (scene.points[n].astype(float) - scene.t[i]) @ scene.R[i]
         chosen: dict[str, np.ndarray] = {}
-        for name, found in zip(part.chain.names, labels[n], strict=True):
+        steps = {}
+        for name in part.chain.names:
             places = candidates(part, scene.parameters[i], chosen)[name]
             distance = np.linalg.norm(places - local, axis=1)
             chosen[name] = places[np.argmin(distance)]
-            step = 2e-3 * scene.parameters[i].max() if len(places) == len(CIRCLE) else 1e-6
-            assert np.linalg.norm(scene.R[i] @ chosen[name] + scene.t[i] - found) < step, (n, name)
+            steps[name] = 2e-3 * scene.parameters[i].max() if len(places) == len(CIRCLE) else 1e-6
+        taught = dict(chosen)
+        if part.name == "tn42":
+            nearest = min(EXCHANGES, key=lambda name: np.linalg.norm(chosen[name] - local))
+            taught |= {name: chosen[other] for name, other in EXCHANGES[nearest].items()}
+            assert which[n] == list(EXCHANGES).index(nearest)
+            seen.add(nearest)
+        for name, found in zip(part.chain.names, labels[n], strict=True):
+            off = scene.R[i] @ taught[name] + scene.t[i] - found
+            assert np.linalg.norm(off) < steps[name], (n, name)
+    assert seen == (set(EXCHANGES) if part.name == "tn42" else set())
+
+
+@pytest.mark.parametrize("choice", [CAMERA, CANONICAL])
+def test_other_rules_exchange_nothing(make_scene, choice):
+    part = TN42({"l": [36], "a": [13], "w": [11]})
+    scene = make_scene(part, bodies=5, points=100)
+    assert "lookalike" not in point_labels(scene, part.chain, choice)
+    keypoints = point_labels(scene, part.chain, choice)["keypoints"].double().numpy()
+    local = np.einsum("nij,nmi->nmj", scene.R[scene.instance], keypoints - scene.t[scene.instance][:, None])
+    own = np.stack([candidates(part, scene.parameters[0], {})[name][0] for name in part.chain.names])
+    local[..., 1] = np.abs(local[..., 1])  # the camera's side is one of two
+    np.testing.assert_allclose(local, np.broadcast_to(own, local.shape), atol=1e-6)
 
 
 def rotations(n: int, seed: int) -> torch.Tensor:

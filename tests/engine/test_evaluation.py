@@ -49,6 +49,17 @@ def test_perfect_detections_have_ap_one_and_no_error(part, make_scene):
     assert values["truths_to_find"] == values["true_positives"] == 11 and values["scenes"] == 3
 
 
+def test_each_parameter_of_the_part_has_its_error(part, make_scene):
+    """Every body's first parameter 1 mm too large, its second 2 mm too small, the others right."""
+    scene = make_scene(part)
+    found, off = perfect(scene), torch.zeros(part.k, dtype=torch.float64)
+    off[0], off[1] = 0.001, -0.002
+    values = SceneScorer(part).add_all([scene], [replace(found, parameters=found.parameters + off)]).compute()
+    errors = [values[f"parameter_error_mm/{name}"] for name in part.parameter_names]
+    assert errors == pytest.approx([1.0, 2.0, *[0.0] * (part.k - 2)], abs=1e-9)
+    assert values["parameter_error_mm"] == pytest.approx(3.0 / part.k)
+
+
 def test_nothing_found_is_ap_zero(tn34, make_scene):
     scene = make_scene(tn34)
     none = {name: value[:0] for name, value in vars(perfect(scene)).items()}

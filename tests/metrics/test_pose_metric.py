@@ -1,6 +1,7 @@
 """The gathered scores of a run."""
 
 import math
+import pickle
 
 import pytest
 import roma
@@ -125,3 +126,63 @@ def test_unknown_parameters_in_one_scene_leave_no_error():
         metric.update(SPACE, truth(), results(), torch.full((3, 1), 0.010), torch.full((4, 1), value))
     assert math.isnan(metric.compute()["parameter_error_mm"])
     assert metric.compute()["position_error_mm"] == pytest.approx(1.0, rel=1e-5)
+
+
+def test_each_parameter_has_its_own_error_in_mm():
+    """Of two parameters, one 2 mm off in the first scene and exact in the second, the other 3 and 1 mm."""
+    metric = PoseMetrics(parameter_names=("r", "h"))
+    for r, h in ((0.012, 0.007), (0.010, 0.011)):
+        found = torch.tensor([r, h]).expand(4, 2)
+        metric.update(SPACE, truth(), results(), torch.full((3, 2), 0.010), found)
+    scores = metric.compute()
+    assert scores["parameter_error_mm/r"] == pytest.approx(1.0, rel=1e-5)
+    assert scores["parameter_error_mm/h"] == pytest.approx(2.0, rel=1e-5)
+    assert scores["parameter_error_mm"] == pytest.approx(1.5, rel=1e-5)
+    keys = list(scores)
+    first = keys.index("parameter_error_mm")
+    assert keys[first + 1 : first + 3] == ["parameter_error_mm/r", "parameter_error_mm/h"]
+
+
+def test_names_change_nothing_else():
+    plain, named = PoseMetrics(), PoseMetrics(parameter_names=("r", "h"))
+    for metric in (plain, named):
+        metric.update(SPACE, truth(), results(), torch.full((3, 2), 0.010), torch.full((4, 2), 0.011))
+    scores = named.compute()
+    assert {key: value for key, value in scores.items() if "/" not in key} == plain.compute()
+
+
+@pytest.mark.parametrize("found", [results(), nothing()])
+def test_a_method_without_sizes_and_one_that_found_nothing_have_no_error_of_a_parameter(found):
+    metric = PoseMetrics(parameter_names=("r",))
+    unknown = torch.full((len(found.score), 1), math.nan)
+    metric.update(SPACE, truth(), found, torch.full((3, 1), 0.010), unknown)
+    assert "parameter_error_mm/r" not in metric.compute()
+    assert math.isnan(metric.compute()["parameter_error_mm"])
+
+
+def test_a_parameter_that_some_results_lack_has_no_mean():
+    metric = PoseMetrics(parameter_names=("r", "h"))
+    for h in (0.012, math.nan):
+        found = torch.tensor([0.011, h]).expand(4, 2)
+        metric.update(SPACE, truth(), results(), torch.full((3, 2), 0.010), found)
+    scores = metric.compute()
+    assert scores["parameter_error_mm/r"] == pytest.approx(1.0, rel=1e-5)
+    assert math.isnan(scores["parameter_error_mm/h"]) and math.isnan(scores["parameter_error_mm"])
+
+
+def test_parameters_without_names_of_their_own_are_refused_and_leave_nothing_behind():
+    metric = PoseMetrics(parameter_names=("r", "h"))
+    with pytest.raises(ValueError, match="3 parameters, expected r, h"):
+        metric.update(SPACE, truth(), results(), torch.zeros(3, 3), torch.zeros(4, 3))
+    metric.update(SPACE, truth(), results(), torch.zeros(3, 2), torch.zeros(4, 2))
+    assert metric.compute()["scenes"] == 1
+
+
+def test_gathered_errors_survive_a_copy_and_a_reset():
+    metric = PoseMetrics(parameter_names=("r",))
+    metric.update(SPACE, truth(), results(), torch.full((3, 1), 0.010), torch.full((4, 1), 0.013))
+    again = pickle.loads(pickle.dumps(metric))
+    assert again.compute()["parameter_error_mm/r"] == pytest.approx(3.0, rel=1e-5)
+    metric.reset()
+    metric.update(SPACE, truth(), results(), torch.full((3, 1), 0.010), torch.full((4, 1), 0.011))
+    assert metric.compute()["parameter_error_mm/r"] == pytest.approx(1.0, rel=1e-5)

@@ -9,8 +9,9 @@ import torch
 
 from pnet.data.dataset import Collate
 from pnet.data.targets import point_labels
-from pnet.models.losses import Norm, ParametricLoss
-from pnet.parts.choice import KeypointChoice
+from pnet.models.losses import Norm, ParametricLoss, doubt_loss
+from pnet.parts.choice import KeypointChoice, KeypointRule
+from pnet.parts.tn42 import TN42
 from pnet.records import Batch, PointPrediction
 
 NORMS = list(Norm)
@@ -94,14 +95,16 @@ def test_losses_are_those_of_the_naive_loop(part, batch, norm):
 def test_default_weights_are_the_papers(tn34, tn06):
     weights = ParametricLoss(tn34, "squared").weights
     assert weights == pytest.approx(
-        {"centroid": 200, "keypoints": 200 / 9, "parameters": 25, "visibility": 50}
+        {"centroid": 200, "keypoints": 200 / 9, "parameters": 25, "visibility": 50, "sizes": 0, "doubt": 0}
     )
     assert ParametricLoss(tn06, "squared").weights["parameters"] == pytest.approx(50 / 3)
 
 
 def test_given_weights_replace_them_zero_too(tn34, make_scene, batch):
-    loss = ParametricLoss(tn34, "squared", centroid=0.0, keypoints=7.0)
-    assert loss.weights == pytest.approx({"centroid": 0, "keypoints": 7, "parameters": 25, "visibility": 50})
+    loss = ParametricLoss(tn34, "squared", centroid=0.0, keypoints=7.0, sizes=3.0, doubt=0.5)
+    assert loss.weights == pytest.approx(
+        {"centroid": 0, "keypoints": 7, "parameters": 25, "visibility": 50, "sizes": 3, "doubt": 0.5}
+    )
 
 
 @pytest.mark.parametrize("norm", NORMS)
@@ -206,3 +209,136 @@ def test_ambiguity_is_the_share_of_labels_with_a_near_runner_up(tn34):
 def test_an_unknown_norm_is_refused(tn34):
     with pytest.raises(ValueError, match="cubic"):
         ParametricLoss(tn34, "cubic")
+
+
+def doubting(error: tuple[float, ...], doubt: torch.Tensor) -> tuple[PointPrediction, Batch]:
+    """n points with doubt (n, 6) whose centroid, three keypoints and two sizes are all off by `error`."""
+    n = len(doubt)
+    truth = point([INF] * 3)
+    batch = replace(
+        truth,
+        centroid=truth.centroid.expand(1, n, 3),
+        keypoints=truth.keypoints.expand(1, n, 3, 3),
+        parameters=truth.parameters.expand(1, n, 2),
+    )
+    off = torch.tensor(error)
+    predicted = PointPrediction(
+        batch.centroid + off[0] * torch.tensor([0.6, 0, 0.8]),
+        batch.keypoints + off[1:4, None] * torch.tensor([0, 1.0, 0]),
+        None,
+        doubt[None],
+        batch.parameters - off[4:],
+    )
+    return predicted, batch
+
+
+def test_the_loss_of_doubt_by_hand():
+    """Errors of 3, 1, 2, 4 mm and 0.5, 6 mm, expected to be 1, 1, 4, 2, 1 and 3 mm."""
+    error = (0.003, 0.001, 0.002, 0.004, 0.0005, 0.006)
+    predicted, batch = doubting(error, torch.tensor([[0.001, 0.001, 0.004, 0.002, 0.001, 0.003]]))
+    expected = (3 + 1 + 0.5 + 2 + 0.5 + 2 + math.log(1 * 1 * 4 * 2 * 1 * 3)) / 6
+    assert float(doubt_loss(predicted, predicted.parameters, batch)) == pytest.approx(expected, rel=1e-4)
+
+
+def test_doubt_is_best_at_the_mean_error():
+    """Of points that say the same the errors are 1, 2 and 6 mm: least at 3 mm, on a grid and by its slope."""
+    sizes = (0.001, 0.002, 0.006)
+    cases = [doubting((e,) * 6, torch.ones(1, 6)) for e in sizes]
+
+    def loss(doubt: torch.Tensor) -> torch.Tensor:
+        said = [(replace(predicted, doubt=doubt.expand(1, 1, 6)), batch) for predicted, batch in cases]
+        return torch.stack([doubt_loss(p, p.parameters, batch) for p, batch in said]).mean()
+
+    grid = torch.arange(5, 100) / 10_000
+    assert float(grid[torch.stack([loss(b) for b in grid]).argmin()]) == pytest.approx(0.003)
+    doubt = torch.tensor([0.003, 0.0025, 0.0036], requires_grad=True)
+    for b in doubt:
+        loss(b).backward()
+    at, under, over = doubt.grad.tolist()
+    assert at == pytest.approx(0, abs=0.05) and under < -30 and over > 30  # a metre; of a loss of about 2
+
+
+def test_doubt_teaches_nothing_but_doubt():
+    predicted, batch = doubting((0.003,) * 6, torch.full((4, 6), 0.002))
+    said = {
+        name: getattr(predicted, name).clone().requires_grad_()
+        for name in ("centroid", "keypoints", "doubt", "parameters")
+    }
+    predicted = replace(predicted, **said)
+    doubt_loss(predicted, predicted.parameters, batch).backward()
+    assert said["centroid"].grad is said["keypoints"].grad is said["parameters"].grad is None
+    slope = (1 / 0.002 - 0.003 / 0.002**2) / 24
+    torch.testing.assert_close(said["doubt"].grad, torch.full((1, 4, 6), slope), rtol=1e-3, atol=0)
+
+
+def test_doubt_judges_the_sizes_that_count(tn34):
+    """Those of the head where there is one, else those measured between keypoints."""
+    doubt = torch.full((1, 1, 6), 0.001)
+    batch = point([INF] * 3)
+    exact = PointPrediction(batch.centroid, batch.keypoints, None, doubt)
+    loss = ParametricLoss(tn34, "each", doubt=1.0)
+    assert float(loss(exact, batch)["doubt"]) == pytest.approx(0, abs=1e-4)
+    said = replace(exact, parameters=batch.parameters + 0.006)
+    assert float(loss(said, batch)["doubt"]) == pytest.approx(2 * 6 / 6, rel=1e-3)
+    measured = replace(exact, keypoints=batch.keypoints * torch.tensor([1, 1, 1.003]))  # h is 6 mm too long
+    assert float(loss(measured, batch)["doubt"]) == pytest.approx((3 + 3 + 3 + 6) / 6, rel=1e-2)
+
+
+def test_sizes_are_a_loss_of_their_own(tn34):
+    batch = point([INF] * 3)
+    exact = PointPrediction(batch.centroid, batch.keypoints, batch.visibility)
+    loss = ParametricLoss(tn34, "each", sizes=10.0, doubt=2.0)
+    assert set(loss(exact, batch)) == {"loss", "centroid", "keypoints", "parameters", "visibility"}
+    off = replace(exact, parameters=batch.parameters + torch.tensor([0.003, -0.001]))
+    found = loss(off, batch)
+    assert float(found["sizes"]) == pytest.approx(0.004, rel=1e-3)
+    assert float(found["parameters"]) == pytest.approx(0, abs=1e-6)
+    assert float(found["loss"]) == pytest.approx(0.04, rel=1e-3)
+    doubted = loss(replace(off, doubt=torch.full((1, 1, 6), 0.002)), batch)
+    doubt = math.log(2) + (1.5 + 0.5) / 6
+    assert float(doubted["doubt"]) == pytest.approx(doubt, rel=1e-3)
+    assert float(doubted["loss"]) == pytest.approx(0.04 + 2 * doubt, rel=1e-3)
+
+
+@pytest.fixture
+def bars(make_scene) -> tuple[TN42, Batch]:
+    """Points of bars under the rule `point`, of which every exchange is taught to some."""
+    part = TN42({"l": [36], "a": [13], "w": [11]})
+    scenes = [make_scene(part, seed=seed, points=80) for seed in (0, 1)]
+    items = [point_labels(scene, part.chain, KeypointChoice(KeypointRule.POINT)) for scene in scenes]
+    batch = Collate()([{**item, "scene": torch.tensor(i)} for i, item in enumerate(items)])
+    assert batch.lookalike.shape == (2, 80) and set(batch.lookalike.flatten().tolist()) == {0, 1, 2, 3}
+    return part, batch
+
+
+def test_exchanged_labels_have_the_sizes_of_their_bar(bars):
+    part, batch = bars
+    losses = ParametricLoss(part, "each")(perfect(batch), batch)
+    assert float(losses["parameters"]) < 1e-6 and float(losses["keypoints"]) < 1e-6
+    blind = ParametricLoss(part, "each")(perfect(batch), replace(batch, lookalike=None))
+    assert float(blind["parameters"]) > 0.003  # the small end taken for the large one
+
+
+def test_sizes_of_exchanged_keypoints_are_those_of_the_keypoints_carried_back(bars):
+    """A noisy prediction measured point by point, with the exchange undone by names."""
+    part, batch = bars
+    predicted = noisy(batch)
+    foot, side, toe, head, tip = (part.chain.names.index(n) for n in ("foot", "side", "toe", "head", "tip"))
+    back = [
+        {},
+        {foot: toe, toe: foot, head: tip, tip: head},
+        {foot: head, head: foot, toe: tip, tip: toe},
+        {foot: tip, tip: foot, toe: head, head: toe},
+    ]
+    total = 0.0
+    for i, j in np.ndindex(2, 80):
+        c, kp = predicted.centroid[i, j].numpy(), predicted.keypoints[i, j].numpy()
+        own = [kp[back[int(batch.lookalike[i, j])].get(place, place)] for place in range(5)]
+        measured = [
+            np.linalg.norm(own[toe] - own[foot]),
+            np.linalg.norm(own[head] - own[foot]),
+            2 * np.linalg.norm(own[side] - c),
+        ]
+        total += np.abs(np.subtract(measured, batch.parameters[i, j].numpy())).sum()
+    found = ParametricLoss(part, "each")(predicted, batch)["parameters"]
+    assert float(found) == pytest.approx(total / 160, rel=1e-4)

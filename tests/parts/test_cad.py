@@ -87,6 +87,27 @@ def test_keypoints_of_ones_own(meshes):
         CadPart("own", path, keypoints=keypoints)
 
 
+def test_lookalikes_of_its_keypoints(meshes):
+    """An end for an end, of the bounding cuboid's keypoints."""
+    path = str(meshes / "cuboid.stl")
+    part = CadPart("fitting", path, lookalikes=[[["corner", "z_end"]]])
+    assert part.chain.names == ["corner", "x_end", "y_end", "z_end"]
+    assert part.chain.lookalikes.tolist() == [[0, 1, 2, 3], [3, 1, 2, 0]]
+    assert CadPart("fitting", path).chain.lookalikes.tolist() == [[0, 1, 2, 3]]
+
+
+@pytest.mark.parametrize(
+    ("lookalikes", "message"),
+    [
+        ([["corner", "z_end"]], r"fitting: lookalikes\[0\]\[0\] is 'corner', expected a pair of keypoints"),
+        ([[["corner", "foot"]]], "fitting: lookalikes exchange 'foot', which is none of the keypoints"),
+    ],
+)
+def test_bad_lookalikes_are_named(meshes, lookalikes, message):
+    with pytest.raises(ValueError, match=message):
+        CadPart("fitting", str(meshes / "cuboid.stl"), lookalikes=lookalikes)
+
+
 def test_the_hull_stands_for_the_mesh_in_physics(meshes):
     part = CadPart("fitting", str(meshes / "cuboid.stl"))
     (piece,) = part.convex_pieces(part.part_object("L", 0), fill_holes=True)

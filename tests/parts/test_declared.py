@@ -43,8 +43,14 @@ BAR = {
         "foot": {"from": "centroid", "corner": [0, 0, 0]},
         "toe": {"from": "foot", "plane": "x", "measures": "l"},
         "head": {"from": "foot", "plane": "z", "measures": "a"},
+        "tip": {"from": "toe", "plane": "z", "at": 6},
         "side": {"from": "centroid", "plane": "y", "measures": "w", "factor": 0.5},
     },
+    "lookalikes": [
+        [["foot", "toe"], ["head", "tip"]],
+        [["foot", "head"], ["toe", "tip"]],
+        [["foot", "tip"], ["toe", "head"]],
+    ],
     "learning": {"l": [30, 40], "a": [10, 16], "w": [8, 10]},
 }
 
@@ -65,6 +71,8 @@ def test_a_declared_part_is_its_twin_in_python(declaration, twin):
         rtol=0,
     )
     torch.testing.assert_close(part.chain.group, other.chain.group)
+    assert part.chain.names == other.chain.names
+    assert part.chain.lookalikes.tolist() == other.chain.lookalikes.tolist()
     for row in other.grids["L"]:
         np.testing.assert_allclose(part.centroid(row[None]), other.centroid(row[None]), atol=1e-12)
         mesh, expected = part.mesh(row), other.mesh(row)
@@ -165,6 +173,32 @@ BAD_KEYPOINTS = [
 def test_a_bad_keypoint_is_named(fields, message):
     with pytest.raises(ValueError, match=rf"nut: keypoints.culprit.*{message}"):
         made(NUT, keypoints=NUT["keypoints"] | {"culprit": fields})
+
+
+BAD_LOOKALIKES = [
+    ("foot", r"lookalikes is 'foot', expected a list of exchanges, each a list of pairs of keypoints"),
+    ({"foot": "toe"}, r"lookalikes is \{'foot': 'toe'\}, expected a list of exchanges"),
+    ([["foot", "toe"]], r"lookalikes\[0\]\[0\] is 'foot', expected a pair of keypoints such as"),
+    ([BAR["lookalikes"][0], 7], r"lookalikes\[1\] is 7, expected a list of pairs of keypoints such as"),
+    ([[["foot", "toe", "tip"]]], r"lookalikes\[0\]\[0\] is .*'tip'\], expected the names of two keypoints"),
+    ([[["foot", 3]]], r"lookalikes\[0\]\[0\] is \['foot', 3\], expected the names of two keypoints"),
+    ([[["foot", "paw"]]], "lookalikes exchange 'paw', which is none of the keypoints .*: foot, side, toe, "),
+    ([[["paw", "foot"]]], "lookalikes exchange 'paw', which is none of the keypoints"),
+    ([[["foot", "toe"], ["toe", "tip"]]], "lookalikes: .* exchanges a keypoint twice; name it in one pair"),
+    ([[["head", "tip"]]], "lookalikes: every exchange must bring another keypoint to the place of 'foot'"),
+    ([[]], "lookalikes: every exchange must bring another keypoint to the place of 'foot'"),
+]
+
+
+@pytest.mark.parametrize(("lookalikes", "message"), BAD_LOOKALIKES)
+def test_bad_lookalikes_are_named(lookalikes, message):
+    with pytest.raises(ValueError, match=rf"bar: {message}"):
+        made(BAR, lookalikes=lookalikes)
+
+
+def test_lookalikes_may_be_left_out():
+    part = made({key: value for key, value in BAR.items() if key != "lookalikes"})
+    assert part.lookalikes == () and part.chain.lookalikes.tolist() == [[0, 1, 2, 3, 4]]
 
 
 def test_a_requirement_that_does_not_hold_is_quoted():

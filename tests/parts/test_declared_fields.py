@@ -3,7 +3,7 @@
 import pytest
 
 from pnet.geometry.symmetry import FiniteSymmetry, RevolutionSymmetry, SphericalSymmetry
-from pnet.parts.declared_fields import keypoint_from, mirror_from, symmetry_from
+from pnet.parts.declared_fields import keypoint_from, lookalikes_from, mirror_from, symmetry_from
 from pnet.parts.primitives import Circle, Corner, Cylinder, Plane, Polygon, Sphere
 
 
@@ -48,3 +48,9 @@ def test_other_symmetries_by_name():
 def test_an_unknown_symmetry_is_answered_with_the_choices(value):
     with pytest.raises(ValueError, match=r"symmetry is .*, choose none, revolution, .*\{cyclic: n\}"):
         symmetry_from(value)
+
+
+def test_lookalikes_are_exchanges_of_pairs_of_names():
+    found = lookalikes_from([[["a", "b"], ["c", "d"]], [["a", "c"]]])
+    assert found == ((("a", "b"), ("c", "d")), (("a", "c"),))
+    assert lookalikes_from([]) == ()

@@ -38,6 +38,7 @@ def test_the_keypoints_measure_length_height_and_thickness(part):
     assert (keypoints["toe"] - keypoints["foot"]).tolist() == pytest.approx([0.030, 0, 0])
     assert (keypoints["head"] - keypoints["foot"]).tolist() == pytest.approx([0, 0, 0.012])
     assert keypoints["side"].tolist() == pytest.approx([0, 0.004, 0])
+    assert (keypoints["tip"] - keypoints["toe"]).tolist() == pytest.approx([0, 0, SMALL_END])
 
 
 def test_the_side_is_the_one_nearer_to_the_camera_and_nothing_else_is_chosen(part, rotations):
@@ -47,8 +48,30 @@ def test_the_side_is_the_one_nearer_to_the_camera_and_nothing_else_is_chosen(par
     side = part.chain.names.index("side")
     torch.testing.assert_close(labels[:, side, 1], -0.004 * R[:, 2, 1].sign())
     torch.testing.assert_close(margin[:, side], 0.008 * R[:, 2, 1].abs())
-    others = [i for i in range(4) if i != side]
+    others = [i for i in range(5) if i != side]
     assert torch.equal(labels[:, others], template[:, others]) and bool(margin[:, others].isinf().all())
+
+
+def test_its_keypoints_are_the_corners_of_the_mirror_plane(part):
+    """Each at a corner of the trapezoid, so that an exchange carries corners to corners."""
+    keypoints = part.chain.keypoints_from_parameters(torch.from_numpy(SIZE)).numpy()
+    corners = np.unique(part.mesh(SIZE).vertices[:, [0, 2]].round(9), axis=0)
+    outline = [i for i, name in enumerate(part.chain.names) if name != "side"]
+    found = keypoints[outline][:, [0, 2]].round(9)
+    assert len(outline) == 4 and np.abs(keypoints[outline][:, 1]).max() == 0
+    np.testing.assert_allclose(found[np.lexsort(found.T[::-1])], corners, atol=1e-9)
+
+
+def test_its_lookalikes_turn_it_end_for_end_side_for_side_and_both(part):
+    names = part.chain.names
+    assert names == ["foot", "side", "toe", "head", "tip"]
+    exchanged = [[names[i] for i in order] for order in part.chain.lookalikes]
+    assert exchanged == [
+        ["foot", "side", "toe", "head", "tip"],
+        ["toe", "side", "foot", "tip", "head"],
+        ["head", "side", "tip", "foot", "toe"],
+        ["tip", "side", "head", "toe", "foot"],
+    ]
 
 
 def test_its_labels_have_two_structures_that_are_mirror_images(part):

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from pnet.geometry.rigid import apply_pose
 from pnet.geometry.symmetry import SphericalSymmetry, rotation_about_z
 from pnet.parts.base import ParametricPart
-from pnet.parts.choice import KeypointChoice, KeypointRule, NearestToPoint
+from pnet.parts.choice import KeypointChoice, KeypointRule
 from pnet.postprocess.fit import fit_pose
 from pnet.postprocess.folded_vote import FoldedVote, fold
 from pnet.postprocess.grouping import clusters_of
@@ -27,7 +27,7 @@ def surface_votes(part: ParametricPart, sizes, R, t, counts) -> PointVotes:
     for i, count in enumerate(counts):
         surface = torch.from_numpy(part.mesh(sizes[i].numpy()).sample(count, seed=i)).double()
         template = part.chain.keypoints_from_parameters(sizes[i]).expand(count, -1, 3)
-        keypoints.append(apply_pose(R[i], t[i], part.chain.choose(NearestToPoint(surface), template)[0]))
+        keypoints.append(apply_pose(R[i], t[i], part.chain.nearest(surface, template)[0]))
         centroid.append(t[i].expand(count, 3))
         owner += [i] * count
     order = torch.randperm(len(owner), generator=torch.Generator().manual_seed(0))
@@ -107,8 +107,10 @@ def test_votes_for_different_equivalents_meet_where_plain_means_are_far_off(case
     assert float(folded.spread.max()) < 1e-9
     lengths = part.chain.parameters_from_keypoints(plain.centroid, plain.keypoints)[large]
     assert float(((lengths - sizes[large]).abs() / sizes[large]).amax(1).min()) > 0.3
-    # what is measured point by point is right even so
-    torch.testing.assert_close(plain.parameters, sizes, rtol=0, atol=1e-9)
+    if len(part.chain.lookalikes) == 1:  # what is measured point by point is right even so
+        torch.testing.assert_close(plain.parameters, sizes, rtol=0, atol=1e-9)
+    else:  # it is not where it might be another end
+        assert float((plain.parameters - sizes)[large].abs().amax(1).min()) > 0.001
 
 
 def test_a_fold_carries_every_equivalent_to_the_templates_place(any_part, random_sizes):
@@ -118,12 +120,13 @@ def test_a_fold_carries_every_equivalent_to_the_templates_place(any_part, random
     if any_part.symmetry == SphericalSymmetry():
         turn = torch.from_numpy(Rotation.random(18, 0).as_matrix())
     images = torch.cat([template @ G.mT for G in any_part.chain.group])[None]
-    folded = fold(any_part.chain, template, images)
+    folded, which = fold(any_part.chain, template, images)
+    assert not bool(which.any())  # nothing was exchanged
     torch.testing.assert_close(folded, template[:, None].expand_as(folded), rtol=0, atol=1e-12)
     if not all(any_part.chain.is_finite):  # free keypoints anywhere on their circle
         free = ~torch.tensor(any_part.chain.is_finite)
         turned = torch.where(free[:, None], template @ turn.mT, template)[None]
-        torch.testing.assert_close(fold(any_part.chain, template, turned)[0], template.expand(18, -1, 3))
+        torch.testing.assert_close(fold(any_part.chain, template, turned)[0][0], template.expand(18, -1, 3))
 
 
 @settings(max_examples=10, deadline=None)
@@ -134,8 +137,12 @@ def test_which_equivalent_a_noisy_vote_means_does_not_matter(any_part, random_si
     noise = torch.randn(3, 20, len(chain), 3, generator=generator, dtype=torch.float64)
     local = template[:, None] + 0.0005 * noise
     element = chain.group[torch.randint(len(chain.group), (3, 20), generator=generator)]
-    folded = fold(chain, template, local @ element.mT)
-    torch.testing.assert_close(folded, fold(chain, template, local), rtol=0, atol=1e-12)
+    q = len(chain.lookalikes)
+    meant = torch.randint(q, (3, 20), generator=generator)
+    folded, which = fold(chain, template, chain.exchanged(local @ element.mT, meant))
+    expected, own = fold(chain, template, local)
+    torch.testing.assert_close(folded, expected, rtol=0, atol=1e-12)
+    assert not bool(own.any()) and torch.equal(which, meant)
 
 
 def test_a_fold_leaves_a_votes_error_as_large_as_it_was(tn42, random_sizes):
@@ -143,7 +150,7 @@ def test_a_fold_leaves_a_votes_error_as_large_as_it_was(tn42, random_sizes):
     template = tn42.chain.keypoints_from_parameters(random_sizes(tn42, 1))
     off = torch.tensor([0.001, 0.002, -0.0005], dtype=torch.float64)
     mirror = torch.tensor([1.0, -1, 1], dtype=torch.float64)
-    found = fold(tn42.chain, template, (template * mirror + off)[:, None])
+    found, _ = fold(tn42.chain, template, (template * mirror + off)[:, None])
     torch.testing.assert_close(found[:, 0], template + off * mirror, rtol=0, atol=1e-15)
 
 

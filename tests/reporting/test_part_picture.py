@@ -86,7 +86,7 @@ def test_the_file_is_a_picture_of_the_expected_size_and_nothing_else_is_left(bar
 
 def test_keypoints_appear_where_the_camera_has_them_the_hidden_ones_dimmed(bar, bar_picture):
     parameters = bar.part_object("L", 0)
-    image, colours = pixels_of(bar_picture), instance_colours(4)
+    image, colours = pixels_of(bar_picture), instance_colours(5)
     places = keypoint_places(bar, parameters)[1:]
     seen_hidden = []
     for (left, top), view in zip(PANEL_CORNERS, part_views(bar, parameters), strict=True):

@@ -43,6 +43,7 @@ def test_every_keypoint_has_its_rule(bar):
         ["side", "centroid", "plane", "w (distance 0.5 of it)", "2", ""],
         ["toe", "foot", "plane", "l", "only itself", ""],
         ["head", "foot", "plane", "a", "only itself", ""],
+        ["tip", "toe", "plane", "nothing, a reference", "only itself", ""],
     ]
 
 

@@ -54,6 +54,33 @@ def test_the_table_is_in_a_fixed_order_with_unknown_metrics_last():
     assert [row[:2] for row in rows] == [("AP", "–"), ("Scenes", "3"), ("own", "0.500")]
 
 
+def test_each_parameter_stands_after_the_error_of_all():
+    given = {
+        "scenes": 3,
+        "parameter_error_mm/l": 0.434,
+        "parameter_error_mm/a": None,
+        "parameter_error_mm": 0.3,
+    }
+    assert [row[:2] for row in cells(metrics_table(given))] == [
+        ("Parameter error", "0.30 mm"),
+        ("Parameter error, l", "0.43 mm"),
+        ("Parameter error, a", "–"),
+        ("Scenes", "3"),
+    ]
+    rows = headline_rows({**given, "AP": 0.5})
+    assert [row[0] for row in rows[6:]] == [
+        *("Parameter error", "Parameter error, l", "Parameter error, a", "Time per scene")
+    ]
+    assert rows[7][2] == "Mean error of dimension l of found bodies."
+
+
+def test_the_error_of_a_parameter_alone_is_shown_too():
+    assert [row[:2] for row in cells(metrics_table({"AP": 0.5, "parameter_error_mm/r": 1.0}))] == [
+        ("AP", "0.500"),
+        ("Parameter error, r", "1.00 mm"),
+    ]
+
+
 def test_the_table_is_printed():
     console = Console(width=100, file=StringIO())
     console.print(metrics_table({"AP": 0.5}))

@@ -13,6 +13,7 @@ from torch.nn import functional as F
 
 from pnet.backbones.base import Backbone
 from pnet.backbones.layers import conv_block, shared_mlp
+from pnet.backbones.slopes import SLOPE_FEATURES, SurfaceSlopes
 from pnet.ops.gathering import gather_rows, scatter_sum
 from pnet.ops.pyramid import Tables
 
@@ -27,7 +28,8 @@ class RangeUNet(Backbone):
         channels: of the levels, finest first; each level halves the resolution.
         cell: width of a cell at `depth`, metres. depth: nominal distance of the surface, metres.
         depth_scale: depth differences are divided by it, metres.
-        features: F.
+        features: F. slopes: the network also sees the normals of planes through windows of this radius in
+            cells, see `SurfaceSlopes`; None: it doesn't.
     """
 
     batches_agree = False
@@ -39,6 +41,7 @@ class RangeUNet(Backbone):
         depth: float,
         depth_scale: float,
         features: int,
+        slopes: int | None = None,
     ) -> None:
         super().__init__()
         if len(channels) < 2 or cell <= 0 or depth <= 0 or depth_scale <= 0:
@@ -47,9 +50,9 @@ class RangeUNet(Backbone):
         self._angle, self._depth_scale = cell / depth, depth_scale
         self._multiple = 2 ** (len(channels) - 1)
         steps = list(pairwise(channels))
-        self.enter = nn.Sequential(
-            conv_block(CELL_FEATURES, channels[0]), conv_block(channels[0], channels[0])
-        )
+        self.slopes = None if slopes is None else SurfaceSlopes(slopes, depth_scale, cell)
+        seen = CELL_FEATURES + (0 if slopes is None else SLOPE_FEATURES)
+        self.enter = nn.Sequential(conv_block(seen, channels[0]), conv_block(channels[0], channels[0]))
         self.down = nn.ModuleList(
             nn.Sequential(conv_block(fine, coarse, 2), conv_block(coarse, coarse)) for fine, coarse in steps
         )
@@ -95,7 +98,10 @@ class RangeUNet(Backbone):
         """Cells → U-Net → back to the points."""
         cell, local = tables["cell"], tables["local"]
         rows, columns = tables["grid"].shape[:2]
-        image = self._unet(_rasterise(cell, local, rows, columns))
+        image = _rasterise(cell, local, rows, columns)
+        if self.slopes is not None:
+            image = torch.cat([image, self.slopes(image)], 1)
+        image = self._unet(image.contiguous(memory_format=torch.channels_last))
         at_points = gather_rows(image.flatten(2).mT, cell)
         features: Tensor = self.leave(torch.cat([at_points.to(local), local], -1))
         return features
@@ -118,5 +124,4 @@ def _rasterise(cell: Tensor, local: Tensor, rows: int, columns: int) -> Tensor:
     total = scatter_sum(content, cell[..., None], rows * columns)
     count = total[..., -1:]
     mean = total / count.clamp(min=1)
-    image = mean.mT.unflatten(2, (rows, columns))
-    return image.contiguous(memory_format=torch.channels_last)
+    return mean.mT.unflatten(2, (rows, columns))

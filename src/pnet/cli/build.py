@@ -52,9 +52,25 @@ def build_parts(cfg: DictConfig) -> Parts:
             "data.targets.rule=point teaches the points of a body different equivalents of a keypoint, and "
             "postprocess.voting takes plain means of them: use postprocess=folded"
         )
+    if isinstance(recovery, PoseRecovery) and cfg.data.targets.rule != KeypointRule.POINT:
+        recovery = recovery.without_lookalikes()  # other rules teach none
+    if "loss" in cfg:  # a bundle of trained weights has none
+        check_heads(cfg)
     backbone = instantiate(cfg.backbone)
-    network = instantiate(cfg.model, backbone=backbone, keypoints=len(part.chain))
+    network = instantiate(
+        cfg.model, backbone=backbone, keypoints=len(part.chain), parameters=len(part.parameter_names)
+    )
     return Parts(part, network.to(memory_format=torch.channels_last), backbone, recovery)
+
+
+def check_heads(cfg: DictConfig) -> None:
+    """Raise ValueError where a head is used that the loss does not teach."""
+    for head in ("sizes", "doubt"):
+        if cfg.model.get(head) and head in cfg.loss and not cfg.loss[head]:
+            raise ValueError(
+                f"model.{head} is true and loss.{head} is {cfg.loss[head]}: the head would say anything; "
+                f"give the loss a weight or set model.{head}=false"
+            )
 
 
 def check_ablations(cfg: DictConfig) -> None:

@@ -12,8 +12,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from pnet.cli.app import error_text
 from pnet.cli.build import network_method, part_of, read_weights
+from pnet.cli.bundle_notes import about
 from pnet.cli.evaluate import recovery_settings
-from pnet.cli.settings import METRICS, is_trained, read_run
+from pnet.cli.pretrained import pretrained_bundle
+from pnet.cli.settings import is_trained, read_run
 from pnet.data.background import Background
 from pnet.engine.bundle import Bundle, read_bundle
 from pnet.engine.depth_estimator import DepthEstimator
@@ -58,7 +60,7 @@ class Estimator(DepthEstimator):
         if device == "cuda" and not torch.cuda.is_available():
             raise ValueError("device=cuda: torch finds no GPU here; use device=auto")
         path = Path(run)
-        source = run_bundle(path) if path.is_dir() else read_bundle(path)
+        source = bundle_of(path)
         with TemporaryDirectory() as folder:
             try:
                 cfg = settings_of(source, path, Path(folder))
@@ -67,6 +69,30 @@ class Estimator(DepthEstimator):
             except UNSUITABLE as fault:
                 raise ValueError(f"{path}: its settings describe no network ({error_text(fault)})") from fault
         return cls(method, source.points, source.camera, background)
+
+    @classmethod
+    def pretrained(
+        cls,
+        part: str,
+        *,
+        postprocess: dict[str, Any] | None = None,
+        background: Background | None = None,
+        device: str = "auto",
+    ) -> Self:
+        """The estimator of the weights that come with pnet for a part.
+
+        Args:
+            part: the template's name, for instance "tn34". The others: see `load`.
+        Raises:
+            ValueError: where no weights come with pnet for the part; names those that there are.
+        """
+        bundle = pretrained_bundle(part)
+        return cls.load(bundle, postprocess=postprocess, background=background, device=device)
+
+
+def bundle_of(path: Path) -> Bundle:
+    """What a run's folder or a bundle's file holds."""
+    return run_bundle(path) if path.is_dir() else read_bundle(path)
 
 
 def run_bundle(run: Path) -> Bundle:
@@ -84,7 +110,7 @@ def run_bundle(run: Path) -> Bundle:
     points = cfg.data.points or seen.points
     if points is None:
         raise ValueError(f"{run / MANIFEST}: does not say how many points the scenes had; set data.points")
-    return Bundle(settings, weights, points, seen.camera, mesh_files(settings), about(run))
+    return Bundle(settings, weights, points, seen.camera, mesh_files(settings), about(run, cfg))
 
 
 @dataclass(frozen=True)
@@ -132,14 +158,3 @@ def settings_of(bundle: Bundle, path: Path, folder: Path) -> DictConfig:
     if cfg.part.get("mesh") in bundle.files:
         cfg.part.mesh = str(folder / cfg.part.mesh)
     return cfg
-
-
-def about(run: Path) -> dict[str, Any]:
-    """Where the weights of a run come from: code, machine, data, how good they are."""
-    state = read_json(run / "provenance.json")
-    found: dict[str, Any] = {
-        key: state[key] for key in ("commits", "packages", "machine", "device", "seed") if key in state
-    }
-    metrics = read_json(run / METRICS) if (run / METRICS).is_file() else {}
-    kept = ("steps", "training_seconds", "validation", "evaluations")
-    return {**found, **{key: metrics[key] for key in kept if key in metrics}}

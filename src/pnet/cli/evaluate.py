@@ -146,6 +146,25 @@ def open_scenes(evaluation: Evaluation, trained: DictConfig) -> tuple["SceneSet"
     return source.scenes(evaluation.split, part_of(trained), evaluation.every), fingerprint
 
 
+def predicted_scenes(cfg: DictConfig, trained: DictConfig, split: str, data: str) -> "SceneSet":
+    """The scenes that predictions were made from, as a command names them.
+
+    Args:
+        cfg: of the command, whose `data` may name another data set. trained: the run's settings.
+        split, data: of the predictions' header.
+    Raises:
+        ValueError: where the data set is another one.
+    """
+    root, source = other_data(cfg)
+    scenes, fingerprint = open_scenes(Evaluation(split, root=root, source=source), trained)
+    if fingerprint != data:
+        raise ValueError(
+            f"{root or trained.data.root}: is not the data that the predictions were made from; "
+            "give data.root (and data=) as for pnet-evaluate, or evaluate again"
+        )
+    return scenes
+
+
 def recovery_settings(changed: dict[str, Any], trained: DictConfig) -> DictConfig:
     """A run's post-processing with changed settings; an unknown key is an error."""
     changes = OmegaConf.create(changed)
@@ -154,6 +173,8 @@ def recovery_settings(changed: dict[str, Any], trained: DictConfig) -> DictConfi
     merged = OmegaConf.create(OmegaConf.to_container(trained.postprocess, resolve=True))
     empty = [key for key, value in _leaves(OmegaConf.to_container(merged)) if value is None]
     known = list(key_paths(OmegaConf.to_container(merged)))
+    if merged._target_.endswith(".PoseRecovery"):
+        known.append("doubtful")  # which runs of before it lack
     for key in key_paths(changed):
         if key not in known and not key.startswith(tuple(f"{name}." for name in empty)):
             raise ValueError(f"postprocess.{key}: unknown key{closest(key, known)}")
@@ -180,10 +201,10 @@ def _weights_digest(run: Path) -> str:
     weights = run / "checkpoints" / NAME
     if not weights.is_file():
         raise FileNotFoundError(f"{weights}: no checkpoint there; train first with pnet-train")
-    return _digest(weights)
+    return file_digest(weights)
 
 
-def _digest(path: Path) -> str:
+def file_digest(path: Path) -> str:
     return sha256(path.read_bytes()).hexdigest()[:16]
 
 
@@ -200,7 +221,7 @@ def is_current(evaluation: Evaluation, run: Path, trained: DictConfig) -> bool:
 
     folder = evaluation.folder(run)
     try:
-        if read_json(folder / METRICS).get("predictions") != _digest(folder / PREDICTIONS):
+        if read_json(folder / METRICS).get("predictions") != file_digest(folder / PREDICTIONS):
             return False  # scored before they were predicted anew
         scenes, data = open_scenes(evaluation, trained)
         header, _ = read_predictions(folder / PREDICTIONS)
@@ -252,7 +273,7 @@ def score(evaluation: Evaluation, run: Path, trained: DictConfig) -> dict[str, A
     }
     columns = {"recall": curve.recall.tolist(), "precision": curve.precision.tolist()}
     write_json(path.with_name("curve.json"), columns)
-    write_json(path.with_name(METRICS), {**metrics, "predictions": _digest(path)})
+    write_json(path.with_name(METRICS), {**metrics, "predictions": file_digest(path)})
     return metrics
 
 

@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from pnet.cli.app import EXPECTED, error_text, run_app
 from pnet.cli.prediction_inputs import camera_words
+from pnet.cli.pretrained import part_words, with_run
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,7 +32,7 @@ NOTHING = (
 
 def main() -> None:
     """Entry point."""
-    sys.argv[1:] = camera_words(sys.argv[1:])
+    sys.argv[1:] = part_words(camera_words(sys.argv[1:]))
     run_app(predict, "predict")
 
 
@@ -72,6 +73,7 @@ def predict(cfg: DictConfig) -> None:
     from pnet.cli.prediction_outputs import Done, Writer, check_outputs, state_of
 
     check_values(cfg)
+    cfg = with_run(cfg)
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
     others = other_files(cfg)

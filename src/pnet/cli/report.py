@@ -24,7 +24,7 @@ def report(cfg: DictConfig) -> None:
     """Write report.html and scene.png into the run's report folder; print their paths and the metrics."""
     from rich.console import Console
 
-    from pnet.cli.evaluate import PREDICTIONS, Evaluation, open_scenes, other_data
+    from pnet.cli.evaluate import PREDICTIONS, predicted_scenes
     from pnet.cli.instantiate import instantiate
     from pnet.engine.predictions import read_predictions
     from pnet.engine.provenance import read_json
@@ -39,13 +39,7 @@ def report(cfg: DictConfig) -> None:
     metrics = read_json(evaluation / "metrics.json")
     header, found = read_predictions(evaluation / PREDICTIONS)
     part = instantiate(trained.part)
-    root, source = other_data(cfg)
-    scenes, fingerprint = open_scenes(Evaluation(header.split, root=root, source=source), trained)
-    if fingerprint != header.data:
-        raise ValueError(
-            f"{root or trained.data.root}: is not the data that the predictions were made from; "
-            "give data.root (and data=) as for pnet-evaluate, or evaluate again"
-        )
+    scenes = predicted_scenes(cfg, trained, header.split, header.data)
     shown = pick_scenes(header.scenes, cfg.scenes)
     folder = run / "report"
     folder.mkdir(exist_ok=True)

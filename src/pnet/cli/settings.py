@@ -33,6 +33,7 @@ def training_settings(run: DictConfig | dict[str, Any]) -> dict[str, Any]:
         OmegaConf.to_container(run, resolve=True) if isinstance(run, DictConfig) else deepcopy(run)
     )
     settings["data"].setdefault("source", None)  # runs of before had pnet's own store alone
+    _leave_out_what_is_off(settings)
     for key in DECIDE_NOTHING:
         group, _, name = key.rpartition(".")
         (settings.get(group, {}) if group else settings).pop(name, None)
@@ -40,6 +41,17 @@ def training_settings(run: DictConfig | dict[str, Any]) -> dict[str, Any]:
         settings.pop("postprocess", None)
         settings["method"].pop("name", None)
     return settings
+
+
+def _leave_out_what_is_off(settings: dict[str, Any]) -> None:
+    """Drop what changes nothing, so that runs of before it was there are found as well."""
+    for head in ("sizes", "doubt"):
+        if not settings["model"].get(head):
+            settings["model"].pop(head, None)
+            settings["loss"].pop(head, None)
+    for group, key in (("model", "pooling"), ("backbone", "slopes")):
+        if settings[group].get(key) is None:
+            settings[group].pop(key, None)
 
 
 def is_trained(cfg: DictConfig) -> bool:

@@ -1,22 +1,22 @@
 """pnet-table: the paper's tables, our figures beside the published ones."""
 
-from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from pnet.cli.app import key_of, run_app, short_name
 from pnet.cli.jobs import cell_evaluation, composed, restricted
-from pnet.cli.runs import RunIndex, read_json_object, read_metrics
+from pnet.cli.runs import RunIndex, read_metrics
 from pnet.cli.sweep_file import CellPlan, TablePlan, read_sweep
-from pnet.scenes.manifest import MANIFEST, settings_fingerprint
+from pnet.cli.table_runs import Collected, Served, curve_runs, error_rows, mixtures, run_facts
 
 if TYPE_CHECKING:
-    from pnet.reporting.paper_table import PaperTable, RunFacts
+    from rich.console import Console
+
+    from pnet.reporting.paper_table import PaperTable
 
 OWN = ("table", "runs", "output")  # the command's own keys; all others are those of the sweep
 
@@ -30,27 +30,48 @@ def table(cfg: DictConfig) -> None:
     """Collect, print and write each table."""
     from rich.console import Console
 
-    from pnet.reporting.paper_chart import chart
-    from pnet.reporting.paper_table import csv_text, latex, markdown, rich_table
-    from pnet.scenes.record_file import write_atomically
-
     words = [word for word in HydraConfig.get().overrides.task if key_of(word) not in OWN]
     out, folder = Console(soft_wrap=True), Path(cfg.output)
     index = RunIndex(Path(cfg.runs))
     for plan in read_sweep(sweep_name(str(cfg.table))):
-        found = collect(plan, words, index, " ".join([cfg.protocol.name, *further(words)]))
-        out.print(rich_table(found))
-        folder.mkdir(parents=True, exist_ok=True)
+        collected = Collected(plan)
+        found = collect(plan, words, index, " ".join([cfg.protocol.name, *further(words)]), collected)
         stem = folder / short_name(
             "_".join([f"table_{plan.number}", cfg.protocol.name, *further(words)]).replace("=", "-")
         )
-        for ending, text in (("md", markdown(found)), ("csv", csv_text(found)), ("tex", latex(found))):
-            write_atomically(stem.with_name(f"{stem.name}.{ending}"), text.encode())
-        chart(found, stem.with_name(f"{stem.name}.png"))
-        for line in found.missing:
-            out.print(f"· {line}", markup=False)
-        out.print(standing(found))
-        out.print(f"written to {stem}.md, .csv, .tex, .png\n")
+        present(found, collected, index, stem, out)
+
+
+def present(found: "PaperTable", collected: Collected, index: RunIndex, stem: Path, out: "Console") -> None:
+    """Print a table and write its files.
+
+    Args:
+        collected: what it was made of. stem: where its files go, without their endings.
+    """
+    from pnet.reporting.error_table import errors_csv, errors_markdown, errors_rich
+    from pnet.reporting.learning_curves import learning_curves
+    from pnet.reporting.paper_chart import chart
+    from pnet.reporting.paper_table import csv_text, latex, markdown, rich_table
+    from pnet.scenes.record_file import write_atomically
+
+    errors = error_rows(collected, index)
+    texts = {".md": markdown(found, errors_markdown(errors)), ".csv": csv_text(found), ".tex": latex(found)}
+    out.print(rich_table(found))
+    if errors:
+        texts["_errors.csv"] = errors_csv(found, errors)
+        out.print(errors_rich(found, errors))
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    for ending, text in texts.items():
+        write_atomically(stem.with_name(stem.name + ending), text.encode())
+    chart(found, stem.with_name(f"{stem.name}.png"))
+    runs = curve_runs(collected, index)
+    title = f"{found.heading}. Learning curves; protocol: {found.protocol}"
+    left_out = learning_curves(runs, stem.with_name(f"{stem.name}_curves.png"), title)
+    for line in (*found.missing, *left_out):
+        out.print(f"· {line}", markup=False)
+    out.print(standing(found))
+    curves = ["_curves.png"] if len(left_out) < len(runs) else []
+    out.print(f"written to {stem}{', '.join([*texts, '.png', *curves])}\n", markup=False)
 
 
 def further(words: Sequence[str]) -> list[str]:
@@ -78,35 +99,23 @@ def sweep_name(name: str) -> str:
     return ",".join(f"table{word}" if word.isdigit() else word for word in name.split(","))
 
 
-def _nested() -> dict[str, dict[str, set[Path]]]:
-    return defaultdict(lambda: defaultdict(set))
-
-
-@dataclass
-class Collected:
-    """What was found for a table so far.
-
-    Attributes:
-        missing: a line for each cell without a figure. serves: run → cells.
-        data, trained: part → fingerprint of the data scored or trained on → runs.
-    """
-
-    missing: list[str] = field(default_factory=list)
-    serves: dict[Path, list[str]] = field(default_factory=lambda: defaultdict(list))
-    data: dict[str, dict[str, set[Path]]] = field(default_factory=_nested)
-    trained: dict[str, dict[str, set[Path]]] = field(default_factory=_nested)
-
-
-def collect(plan: TablePlan, words: Sequence[str], index: RunIndex, protocol: str) -> "PaperTable":
+def collect(
+    plan: TablePlan,
+    words: Sequence[str],
+    index: RunIndex,
+    protocol: str,
+    collected: Collected | None = None,
+) -> "PaperTable":
     """A table with the figures of the runs that are there.
 
     Args:
         plan: rows, columns and published figures. words: further overrides of the sweep.
         index: of the runs. protocol: the name to print.
+        collected: is given what was found, for what stands beside the table.
     """
     from pnet.reporting.paper_table import Cell, Column, PaperTable, Row
 
-    collected = Collected()
+    collected = Collected(plan) if collected is None else collected
     ours = {
         (cell.row, cell.column): values_of(cell, overrides, words, index, collected)
         for cell, overrides in restricted(plan, words)
@@ -116,7 +125,7 @@ def collect(plan: TablePlan, words: Sequence[str], index: RunIndex, protocol: st
         published = row.published or (None,) * len(plan.columns)
         cells = [Cell(ours.get((i, j), ()), figure) for j, figure in enumerate(published)]
         rows.append(Row(row.name, tuple(cells), row.origin))
-    runs = tuple(run_facts(run, cells, index) for run, cells in collected.serves.items())
+    runs = tuple(run_facts(run, collected.of(run), index) for run in collected.runs)
     notes = [plan.note] if plan.note else []
     seeds = sorted({len(values) for values in ours.values() if values})
     if len(seeds) > 1:
@@ -129,7 +138,7 @@ def collect(plan: TablePlan, words: Sequence[str], index: RunIndex, protocol: st
         corner=plan.corner,
         columns=tuple(Column(column.name, column.group) for column in plan.columns),
         rows=tuple(rows),
-        warnings=(*notes, *mixtures(runs, collected)),
+        warnings=(*notes, *mixtures(runs, collected, index)),
         missing=tuple(collected.missing),
         runs=runs,
     )
@@ -158,73 +167,10 @@ def values_of(
             reason = f"{run} has no {cell.table.metric} of {evaluation.name}"
             continue
         found.append(float(value))
-        collected.serves[run].append(cell.name)
-        part = str(index.settings[run]["part"]["_target_"])
-        collected.data[part][str(scores.get("data"))].add(run)
-        made = read_json_object(run / MANIFEST)
-        if made is not None:
-            collected.trained[part][settings_fingerprint(made)].add(run)
+        collected.served.append(Served(run, cell, evaluation, scores))
     if not found:
         collected.missing.append(f"{cell.name}: {reason}")
     return tuple(found)
-
-
-def run_facts(run: Path, cells: Sequence[str], index: RunIndex) -> "RunFacts":
-    """What stands behind a run's figures."""
-    from pnet.reporting.paper_table import RunFacts
-
-    metrics, settings, state = read_metrics(run) or {}, index.settings[run], provenance_of(run)
-    evaluations = metrics.get("evaluations", {}).values()
-    fingerprints = sorted({str(scores.get("data")) for scores in evaluations})
-    steps = int(metrics.get("steps") or 0)
-    return RunFacts(
-        cells="; ".join(name.split(": ", 1)[1] for name in cells),
-        folder=str(run),
-        seed=int(settings["seed"]),
-        steps=steps,
-        scene_iterations=steps * int(settings["data"]["batch_size"]) * int(settings["trainer"]["devices"]),
-        training_seconds=metrics.get("training_seconds"),
-        parameters=(metrics.get("network") or {}).get("parameters"),
-        device=f"{state.get('device', 'unknown')}, {state.get('threads', '?')} threads",
-        commit=", ".join(commits_of(state, list(evaluations))),
-        data=f"{settings['data']['root']} ({', '.join(fingerprints)})",
-    )
-
-
-def commits_of(state: dict[str, Any], evaluations: Sequence[dict[str, Any]]) -> list[str]:
-    """The code versions that trained and evaluated a run."""
-    git = state.get("git", {})
-    last = str(git.get("commit", "unknown"))[:7] + ("+changes" if git.get("changed") else "")
-    evaluated = [str(scores["commit"]) for scores in evaluations if "commit" in scores]
-    return list(dict.fromkeys([*state.get("commits", [last]), *evaluated]))
-
-
-def provenance_of(run: Path) -> dict[str, Any]:
-    """A run's provenance.json; empty where it is not readable."""
-    return read_json_object(run / "provenance.json") or {}
-
-
-def mixtures(runs: Sequence["RunFacts"], collected: Collected) -> list[str]:
-    """What the runs of a table do not have in common, though they should: code, libraries, data of a part."""
-    found = []
-    commits = Counter(run.commit for run in runs)
-    if len(commits) > 1:
-        each = ", ".join(f"{commit} ({count} runs)" for commit, count in commits.most_common())
-        found.append(f"the runs are of different code versions: {each}")
-    if any("+changes" in commit for commit in commits):
-        found.append("some runs are of code with changes that are in no commit")
-    for package in ("torch", "numpy", "lightning", "scikit-learn", "small_gicp", "pnet"):
-        versions = {
-            provenance_of(Path(run.folder)).get("packages", {}).get(package, "unknown") for run in runs
-        }
-        if len(versions) > 1:
-            found.append(f"the runs are of different versions of {package}: {', '.join(sorted(versions))}")
-    for what, parts in (("scored", collected.data), ("trained", collected.trained)):
-        for part, data in parts.items():
-            if len(data) > 1:
-                name = part.rsplit(".", 1)[-1]
-                found.append(f"the runs of {name} were {what} on different data: {', '.join(sorted(data))}")
-    return found
 
 
 if __name__ == "__main__":

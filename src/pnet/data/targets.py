@@ -9,7 +9,7 @@ from torch import Tensor
 from pnet.geometry.rigid import apply_inverse_pose, apply_pose
 from pnet.geometry.symmetry import FiniteSymmetry, RevolutionSymmetry
 from pnet.parts.base import ParametricPart, Points
-from pnet.parts.choice import KeypointChoice, KeypointRule, NearestToPoint
+from pnet.parts.choice import KeypointChoice, KeypointRule
 from pnet.parts.keypoints import KeypointChain
 from pnet.records import Scene
 
@@ -27,21 +27,22 @@ def instance_keypoints(scene: Scene, chain: KeypointChain, choice: KeypointChoic
     return apply_pose(R, t, local), margin
 
 
-def nearest_keypoints(scene: Scene, chain: KeypointChain) -> tuple[Tensor, Tensor]:
+def nearest_keypoints(scene: Scene, chain: KeypointChain) -> tuple[Tensor, Tensor, Tensor]:
     """For every surface point the equivalent keypoints of its instance that are nearest to it
     (`KeypointRule.POINT`).
 
     Args:
         scene: N points on d instances. chain: the part's keypoints.
     Returns:
-        keypoints (N, m, 3) float64, camera frame, metres; margin (N, m) to the runner-up, metres.
+        keypoints (N, m, 3) float64, camera frame, metres; margin (N, m) to the runner-up, metres; which of
+        the part's lookalikes (N,) int64.
     """
     owner = torch.from_numpy(scene.instance)
     R, t = torch.from_numpy(scene.R)[owner], torch.from_numpy(scene.t)[owner]
     points = apply_inverse_pose(R, t, torch.from_numpy(scene.points).double()[:, None])[:, 0]
     template = chain.keypoints_from_parameters(torch.from_numpy(scene.parameters))[owner]
-    local, margin = chain.choose(NearestToPoint(points), template)
-    return apply_pose(R, t, local), margin
+    local, margin, which = chain.nearest(points, template)
+    return apply_pose(R, t, local), margin, which
 
 
 def point_labels(scene: Scene, chain: KeypointChain, choice: KeypointChoice) -> dict[str, Tensor]:
@@ -51,13 +52,16 @@ def point_labels(scene: Scene, chain: KeypointChain, choice: KeypointChoice) -> 
         scene: N points on d instances; every point lies on one.
     Returns:
         float32 tensors: points (N, 3), centroid (N, 3), keypoints (N, m, 3), margin (N, m), parameters (N, k)
-        in metres, visibility (N,).
+        in metres, visibility (N,); and where lookalikes are exchanged lookalike (N,) int64, which of them.
     """
     owner = torch.from_numpy(scene.instance)
     if len(owner) and (int(owner.min()) < 0 or int(owner.max()) >= len(scene.R)):
         raise ValueError(f"{scene.id}: a point names instance {int(owner.max())} of {len(scene.R)}")
+    exchanged = {}
     if choice.rule is KeypointRule.POINT:
-        keypoints, margin = nearest_keypoints(scene, chain)
+        keypoints, margin, which = nearest_keypoints(scene, chain)
+        if len(chain.lookalikes) > 1:
+            exchanged["lookalike"] = which
     else:
         keypoints, margin = (value[owner] for value in instance_keypoints(scene, chain, choice))
     per_instance = {
@@ -67,7 +71,8 @@ def point_labels(scene: Scene, chain: KeypointChain, choice: KeypointChoice) -> 
     }
     labels = {name: value.float()[owner] for name, value in per_instance.items()}
     points = torch.from_numpy(scene.points)
-    return {"points": points, "keypoints": keypoints.float(), "margin": margin.float(), **labels}
+    labels |= {"points": points, "keypoints": keypoints.float(), "margin": margin.float()}
+    return {**labels, **exchanged}
 
 
 def pose_labels(scene: Scene, part: ParametricPart) -> dict[str, Tensor]:

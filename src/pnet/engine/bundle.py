@@ -20,7 +20,7 @@ from pnet.geometry.camera import Camera
 from pnet.scenes.record_file import write_atomically
 
 FORMAT, VERSION = "pnet-bundle", 1
-SUFFIX = ".pnet"
+SUFFIXES = (".pnet", ".safetensors")  # of a bundle's file
 _WEIGHT, _FILE = "weight/", "file/"  # what a tensor's name begins with
 
 

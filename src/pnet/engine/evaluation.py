@@ -56,7 +56,7 @@ class SceneScorer:
     def __init__(self, part: ParametricPart) -> None:
         self._part = part
         self._spaces: dict[bytes, PoseSpace] = {}
-        self.metrics = PoseMetrics()
+        self.metrics = PoseMetrics(parameter_names=part.parameter_names)
         self._by_object: dict[bytes, PoseMetrics] = defaultdict(PoseMetrics)
 
     def add(self, scene: Scene, found: Detections) -> None:

@@ -1,6 +1,7 @@
 """The scores of a run, gathered scene by scene."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -28,8 +29,8 @@ class PoseMetrics(Metric):
 
     `compute()` gives AP, MAP, F1, recall_at_precision_99; position_error_mm, axis_error_deg and
     parameter_error_mm, means over the relevant true poses' nearest matched results, NaN where there
-    is none; and the counts true_positives, false_positives (every result a positive),
-    truths_to_find, results, scenes.
+    is none; parameter_error_mm/NAME, the same of each named parameter that some of them have; and the
+    counts true_positives, false_positives (every result a positive), truths_to_find, results, scenes.
 
     Note:
         Each process counts its own scenes; nothing is gathered, where several train together each sees all.
@@ -39,13 +40,15 @@ class PoseMetrics(Metric):
     higher_is_better = True
     full_state_update = False
 
-    def __init__(self, max_occlusion: float = 0.5) -> None:
+    def __init__(self, max_occlusion: float = 0.5, parameter_names: Sequence[str] = ()) -> None:
         """
         Args:
             max_occlusion: a true pose that is more occluded than this counts neither way.
+            parameter_names: (k) in the order of every parameter array; without them the mean alone is given.
         """
         super().__init__(sync_on_compute=False)
         self.max_occlusion = max_occlusion
+        self.parameter_names = tuple(parameter_names)
         for name in _FIELDS + _ERRORS:
             self.add_state(name, default=[], dist_reduce_fx=None)
 
@@ -63,8 +66,7 @@ class PoseMetrics(Metric):
             space: the pose distance of the scene's part object.
             truth_parameters: (m, k), result_parameters: (n, k) metres; both or neither.
         """
-        if (truth_parameters is None) != (result_parameters is None):
-            raise ValueError("parameters are given for the truth or the results only, expected both")
+        self._check(truth_parameters, result_parameters)
         match = match_scene(space, truth, results, self.max_occlusion)
         for name in _FIELDS:
             getattr(self, name).append(getattr(match, name))
@@ -72,7 +74,7 @@ class PoseMetrics(Metric):
         self._append_pose_errors(space, truth, results, i, j)
         if truth_parameters is not None and result_parameters is not None:
             error = parameter_error(truth_parameters.cpu()[i], result_parameters.cpu()[j])
-            self._states("parameter").append(error.flatten().double())
+            self._states("parameter").append(error.double())
 
     def compute(self) -> dict[str, float]:
         """All numbers; the names say the units."""
@@ -86,6 +88,7 @@ class PoseMetrics(Metric):
             "position_error_mm": 1000 * self._mean("position"),
             "axis_error_deg": math.degrees(self._mean("axis")),
             "parameter_error_mm": 1000 * self._mean("parameter"),
+            **self._named_errors(),
             "true_positives": true,
             "false_positives": false,
             "truths_to_find": sum(int(m.relevant.sum()) for m in matches),
@@ -103,6 +106,23 @@ class PoseMetrics(Metric):
         Ra, ta, Rb, tb = truth.R[i], truth.t[i], results.R[j], results.t[j]
         self._states("position").append(position_error(space, Ra, ta, Rb, tb))
         self._states("axis").append(axis_error(space, Ra, Rb))
+
+    def _check(self, truth_parameters: Tensor | None, result_parameters: Tensor | None) -> None:
+        if (truth_parameters is None) != (result_parameters is None):
+            raise ValueError("parameters are given for the truth or the results only, expected both")
+        names = self.parameter_names
+        if truth_parameters is not None and names and truth_parameters.shape[-1] != len(names):
+            raise ValueError(f"{truth_parameters.shape[-1]} parameters, expected {', '.join(names)}")
+
+    def _named_errors(self) -> dict[str, float]:
+        """By key, mm. Means over all: NaN where some lack the parameter; no key where all do (PPR-Net)."""
+        values = self._states("parameter")
+        columns = torch.cat(values).T if values else ()
+        return {
+            f"parameter_error_mm/{name}": 1000 * float(column.mean())
+            for name, column in zip(self.parameter_names, columns, strict=False)
+            if not bool(column.isnan().all())
+        }
 
     def _states(self, name: str) -> list[Tensor]:
         return getattr(self, name)

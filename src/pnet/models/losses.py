@@ -42,6 +42,8 @@ class ParametricLoss:
             less, by margin_of_label / (margin_of_label + margin). None: every label counts alike.
         centroid, keypoints, parameters, visibility: the weights λ; None takes the paper's default,
             λ_MC = 200, λ_MKP = 200 / 3m, λ_MP = 50 / k, λ_MV = 50.
+        sizes: weight of the parameters that a head of their own says, where there is one.
+        doubt: weight of what the network says of its own errors, where it says anything.
     """
 
     def __init__(
@@ -53,6 +55,8 @@ class ParametricLoss:
         keypoints: float | None = None,
         parameters: float | None = None,
         visibility: float | None = None,
+        sizes: float = 0.0,
+        doubt: float = 0.0,
     ) -> None:
         chain = part.chain
         m, k = len(chain), len(chain.parameters)
@@ -66,6 +70,7 @@ class ParametricLoss:
             "visibility": (visibility, 50.0),
         }
         self.weights = {name: own if own is not None else paper for name, (own, paper) in given.items()}
+        self.weights |= {"sizes": sizes, "doubt": doubt}
 
     def __call__(self, predicted: PointPrediction, batch: Batch) -> dict[str, Tensor]:
         """Losses of a batch.
@@ -73,7 +78,10 @@ class ParametricLoss:
         Returns:
             "loss" (the weighted sum) and each module's unweighted loss by name; scalars.
         """
-        parameters = self._chain.parameters_from_keypoints(predicted.centroid, predicted.keypoints)
+        keypoints = predicted.keypoints
+        if batch.lookalike is not None:
+            keypoints = self._chain.exchanged(keypoints, batch.lookalike)
+        parameters = self._chain.parameters_from_keypoints(predicted.centroid, keypoints)
         losses = {
             "centroid": self._length(predicted.centroid - batch.centroid),
             "keypoints": self._keypoints(predicted.keypoints - batch.keypoints, batch.margin),
@@ -81,6 +89,11 @@ class ParametricLoss:
         }
         if predicted.visibility is not None:
             losses["visibility"] = (predicted.visibility - batch.visibility).abs().mean()
+        if predicted.parameters is not None:
+            parameters = predicted.parameters
+            losses["sizes"] = (parameters - batch.parameters).abs().sum(-1).mean()
+        if predicted.doubt is not None:
+            losses["doubt"] = doubt_loss(predicted, parameters, batch)
         total = torch.stack([self.weights[name] * loss for name, loss in losses.items()]).sum()
         return {"loss": total, **losses}
 
@@ -107,3 +120,22 @@ class ParametricLoss:
             return squared.mean()
         # the root's slope is infinite at zero: a nanometre of slack keeps it finite
         return (squared + 1e-18).sqrt().mean()
+
+
+def doubt_loss(predicted: PointPrediction, parameters: Tensor, batch: Batch) -> Tensor:
+    """How badly a network knows its own errors: mean of e / b + log (b / 1 mm).
+
+    That is the negative log-likelihood of an exponentially distributed error e under the expectation b
+    (Kendall and Gal, NeurIPS 2017, with a Laplace distribution); least where b is the mean error of points
+    that look alike. The errors are taken as given: doubt must not keep a network from learning.
+
+    Args:
+        predicted: with `doubt`. parameters: (B, N, k) those predicted, metres.
+    """
+    assert predicted.doubt is not None
+    with torch.no_grad():
+        places = torch.cat([predicted.centroid[..., None, :], predicted.keypoints], -2)
+        truth = torch.cat([batch.centroid[..., None, :], batch.keypoints], -2)
+        off = torch.linalg.vector_norm(places - truth, dim=-1)
+        error = torch.cat([off, (parameters - batch.parameters).abs()], -1)
+    return (error / predicted.doubt + (predicted.doubt / 1e-3).log()).mean()

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from pnet.backbones.base import Backbone
 from pnet.backbones.layers import shared_mlp
 from pnet.models.heads import OffsetHead, VisibilityHead
+from pnet.models.instance_pooling import pooling_of
 from pnet.ops.pyramid import Tables
 from pnet.records import PosePrediction
 
@@ -17,10 +18,11 @@ class PPRNet(nn.Module):
     """Backbone with three heads: centroid, rotation as Euler angles, visibility.
 
     Args:
-        backbone: points to features. keypoints: not used, the pose is regressed without any; every network
-            is built with the same arguments, so that `method` alone exchanges them.
-        hidden: of the centroid and rotation heads. visibility_hidden: of the visibility head.
-        scale: metres per unit of the centroid head's last layer.
+        backbone: points to features. hidden: of the centroid and rotation heads. visibility_hidden: of the
+            visibility head.
+        keypoints, parameters, sizes, doubt: not used, the pose is regressed without any; every
+            network is built with the same arguments, so that `method` alone exchanges them.
+        scale: metres per unit of the centroid head's last layer. pooling: see `ParametricNet`.
         visibility: False leaves the visibility head out.
     """
 
@@ -32,10 +34,15 @@ class PPRNet(nn.Module):
         visibility_hidden: Sequence[int],
         scale: float,
         visibility: bool,
+        parameters: int = 0,
+        sizes: bool = False,
+        doubt: bool = False,
+        pooling: float | None = None,
     ) -> None:
         super().__init__()
         self.backbone = backbone
         self.centroid = OffsetHead(backbone.features, hidden, 1, scale)
+        self.pooling = pooling_of(backbone.features, pooling, scale)
         self.rotation = RotationHead(backbone.features, hidden)
         self.visibility = VisibilityHead(backbone.features, visibility_hidden) if visibility else None
 
@@ -49,8 +56,11 @@ class PPRNet(nn.Module):
         if tables is None:
             tables = self.backbone.tables(points)
         features = self.backbone(points, tables)
+        centroid = self.centroid(features, points).squeeze(-2)
+        if self.pooling is not None:
+            features = self.pooling(features, points, centroid)
         return PosePrediction(
-            centroid=self.centroid(features, points).squeeze(-2),
+            centroid=centroid,
             rotation=self.rotation(features),
             visibility=None if self.visibility is None else self.visibility(features),
         )

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pnet.geometry.pose_space import PoseSpace
 from pnet.geometry.symmetry import FiniteSymmetry, Symmetry
-from pnet.parts.keypoints import KeypointChain
+from pnet.parts.keypoints import Exchange, KeypointChain
 from pnet.parts.selection import Keypoint
 from pnet.parts.shapes import Shape
 from pnet.parts.solids import Solid, solid
@@ -35,6 +35,8 @@ class ParametricPart(ABC):
         keypoints: the declaration from which labels, parameters and the fit follow.
         symmetry: proper rotations that leave the part unchanged; a revolution's axis is z.
         mirror: (3, 3) an improper symmetry, or None; only where no proper one does the same to the keypoints.
+        lookalikes: ways to exchange pairs of keypoints (names) such that those of the part in another pose,
+            which looks much the same, lie nearly where they lay; see `KeypointChain`.
         closed_form_centroid: whether the centroid is the signed sum of the shapes' own; None: find out with
             the first and last part objects. False where shapes overlap, or are cut beyond their borders, for
             some sizes only.
@@ -46,6 +48,7 @@ class ParametricPart(ABC):
     keypoints: tuple[Keypoint, ...]
     symmetry: Symmetry
     mirror: Tensor | None = None
+    lookalikes: tuple[Exchange, ...] = ()
     closed_form_centroid: bool | None = None
     is_fixed: bool = False
 
@@ -80,6 +83,7 @@ class ParametricPart(ABC):
                 self.mirror,
                 self.centroid,
                 typical=np.concatenate(list(self.grids.values())),
+                lookalikes=self.lookalikes,
             )
         except ValueError as fault:
             raise ValueError(f"{self.name}: {fault}") from fault

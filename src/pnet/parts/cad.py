@@ -7,7 +7,7 @@ simple bounding primitives": the parameters are the sizes of those, all of one v
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
@@ -19,7 +19,14 @@ from scipy.spatial import ConvexHull
 
 from pnet.geometry.symmetry import RevolutionSymmetry, SphericalSymmetry, Symmetry
 from pnet.parts.base import ParametricPart
-from pnet.parts.declared_fields import Fields, check_kind, keypoint_from, mirror_from, symmetry_from
+from pnet.parts.declared_fields import (
+    Fields,
+    check_kind,
+    keypoint_from,
+    lookalikes_from,
+    mirror_from,
+    symmetry_from,
+)
 from pnet.parts.primitives import Circle, Corner, Plane, Sphere
 from pnet.parts.selection import Keypoint
 from pnet.parts.shapes import Shape
@@ -39,7 +46,7 @@ class CadPart(ParametricPart):
             "sphere" (r); used where no keypoints are given.
         keypoints, sizes: a declaration of one's own as in `DeclaredPart`, and the value of every parameter,
             mm.
-        symmetry, mirror: as in `DeclaredPart`.
+        symmetry, mirror, lookalikes: as in `DeclaredPart`.
         collision: "hull" or "coacd" (convex pieces by the package coacd) for physics.
     """
 
@@ -53,6 +60,7 @@ class CadPart(ParametricPart):
         bounds: str = "cuboid",
         symmetry: str | Fields = "none",
         mirror: str | None = None,
+        lookalikes: Sequence[Sequence[Sequence[str]]] = (),
         keypoints: Mapping[str, Fields] | None = None,
         sizes: Mapping[str, float] | None = None,
         collision: str = "hull",
@@ -62,6 +70,10 @@ class CadPart(ParametricPart):
         if not isinstance(mesh, str):
             raise ValueError(f"{name}: mesh is {mesh!r}, expected a file's path; give it as part.mesh=")
         self.symmetry, self.mirror = symmetry_from(symmetry), mirror_from(mirror)
+        try:
+            self.lookalikes = lookalikes_from(lookalikes)
+        except ValueError as fault:
+            raise ValueError(f"{name}: {fault}") from fault
         self._body = CadShape(read_mesh(Path(mesh), unit), collision)
         if keypoints is None:
             chosen, found = bounding_keypoints(bounds, self._body.whole, self.symmetry)

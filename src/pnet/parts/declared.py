@@ -19,6 +19,7 @@ from pnet.parts.declared_fields import (
     check_shape,
     closest,
     keypoint_from,
+    lookalikes_from,
     mirror_from,
     symmetry_from,
 )
@@ -41,6 +42,8 @@ class DeclaredPart(ParametricPart):
         symmetry: "none", "revolution", "revolution_equal_ends", "sphere", {cyclic: n}, {dihedral: n} or
             {rotations: [matrices]}. mirror: normal of a mirror plane through the centroid ("x", "y", …), or
             None.
+        lookalikes: exchanges `[[KEYPOINT, KEYPOINT], …]` of a part that looks much the same in other poses;
+            see `ParametricPart`.
         require: comparisons that valid parameters satisfy, such as "d > 2 * r".
         learning, generalization, sections, closed_form_centroid: see `ParametricPart`.
     """
@@ -55,6 +58,7 @@ class DeclaredPart(ParametricPart):
         generalization: Grid | None = None,
         symmetry: str | Fields = "none",
         mirror: str | None = None,
+        lookalikes: Sequence[Sequence[Sequence[str]]] = (),
         require: Sequence[str] = (),
         sections: int = 48,
         closed_form_centroid: bool | None = None,
@@ -79,6 +83,7 @@ class DeclaredPart(ParametricPart):
             self.keypoints = tuple(keypoint_from(key, fields) for key, fields in keypoints.items())
             self.symmetry = symmetry_from(symmetry)
             self.mirror = mirror_from(mirror)
+            self.lookalikes = lookalikes_from(lookalikes)
         except ValueError as fault:
             raise ValueError(f"{name}: {fault}") from fault
         super().__init__(learning, generalization, sections)

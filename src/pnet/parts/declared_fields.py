@@ -1,5 +1,5 @@
-"""Fields of a declared part that need no solid: keypoints, symmetry and mirror, and checks that name what is
-wrong."""
+"""Fields of a declared part that need no solid: keypoints and their lookalikes, symmetry and mirror, and
+checks that name what is wrong."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from pnet.geometry.symmetry import (
     dihedral,
     reflection,
 )
+from pnet.parts.keypoints import Exchange
 from pnet.parts.primitives import Circle, Corner, Cylinder, Direction, Plane, Polygon, Primitive, Sphere, unit
 from pnet.parts.selection import Keypoint
 
@@ -125,6 +126,23 @@ def symmetry_from(value: str | Fields) -> Symmetry:
 def mirror_from(normal: str | None) -> torch.Tensor | None:
     """The reflection in the plane with this normal."""
     return None if normal is None else reflection(tuple(unit(_direction("mirror", normal)).tolist()))
+
+
+def lookalikes_from(value: Sequence[Sequence[Sequence[str]]]) -> tuple[Exchange, ...]:
+    """Exchanges of keypoints out of lists of pairs of names; see `DeclaredPart`."""
+    check_kind(Sequence, "a list of exchanges, each a list of pairs of keypoints", lookalikes=value)
+    return tuple(_exchange(f"lookalikes[{i}]", pairs) for i, pairs in enumerate(value))
+
+
+def _exchange(where: str, pairs: Sequence[Sequence[str]]) -> Exchange:
+    check_kind(Sequence, "a list of pairs of keypoints such as [[foot, toe], [head, tip]]", **{where: pairs})
+    found = []
+    for i, pair in enumerate(pairs):
+        check_kind(Sequence, "a pair of keypoints such as [foot, toe]", **{f"{where}[{i}]": pair})
+        if len(pair) != 2 or not all(isinstance(name, str) for name in pair):
+            raise ValueError(f"{where}[{i}] is {pair!r}, expected the names of two keypoints")
+        found.append((pair[0], pair[1]))
+    return tuple(found)
 
 
 def check_kind(kind: type, words: str, **fields: Any) -> None:

@@ -1,7 +1,9 @@
 """Keypoints from parameters and back, from one declaration (Section II.A of the paper)."""
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from functools import partial
+from itertools import chain, product
 
 import numpy as np
 import torch
@@ -10,7 +12,14 @@ from torch import Tensor
 
 from pnet.geometry.constants import converted
 from pnet.geometry.symmetry import Symmetry, full_group
-from pnet.parts.choice import Judge, KeypointChoice, KeypointRule, NearestToCamera, first_by
+from pnet.parts.choice import (
+    Judge,
+    KeypointChoice,
+    KeypointRule,
+    NearestToCamera,
+    NearestToPoint,
+    first_by,
+)
 from pnet.parts.declaration import check_circles, check_declaration
 from pnet.parts.equivalents import allowed, along_and_radial, distinct_images, images_of
 from pnet.parts.expressions import Expression, length
@@ -18,6 +27,9 @@ from pnet.parts.primitives import Corner, Freedom, Plane
 from pnet.parts.selection import CENTROID, Keypoint, select_keypoints
 
 Points = NDArray[np.float64]
+
+
+Exchange = tuple[tuple[str, str], ...]  # pairs of keypoints that change places
 
 
 class KeypointChain:
@@ -34,6 +46,12 @@ class KeypointChain:
             origin.
         typical: (n, k) parameters of part objects, metres; they tell which symmetry elements move a
             keypoint, and stand in where estimated sizes make no solid.
+        lookalikes: exchanges of keypoints, for a part that looks much the same in several poses that no
+            symmetry relates, as a slightly tapered bar does end for end. A network can hardly tell which
+            end is which, but it can tell where the nearer one is: under the rule `point` every point is
+            taught the exchanged keypoints of which the first lies nearest to it, and what was exchanged
+            follows from the distances between the voted keypoints. Any two of them, one after the other,
+            make a third.
 
     Attributes:
         reference: (m) place of each keypoint's reference among centroid, keypoint 0, keypoint 1, …
@@ -41,6 +59,8 @@ class KeypointChain:
         is_finite: (m) whether each keypoint and its references have finitely many equivalents.
         chiralities: one or two (3, 3) matrices: the finite label keypoints are always a rotated image of the
             template's seen through one of them ("two chirality structures at most", Section II.B).
+        lookalikes: (q, m) int64, for every exchange which keypoint stands at each place; the first exchanges
+            nothing.
     """
 
     def __init__(
@@ -51,6 +71,7 @@ class KeypointChain:
         mirror: Tensor | None = None,
         centroid: Callable[[Points], Points] | None = None,
         typical: Points | None = None,
+        lookalikes: Sequence[Exchange] = (),
     ) -> None:
         self.parameters = tuple(parameters)
         self.keypoints = select_keypoints(keypoints, self.parameters)
@@ -70,6 +91,7 @@ class KeypointChain:
         ]
         self.chiralities = self._find_chiralities(templates[0], mirror)
         check_circles(self)
+        self.lookalikes = self._permutations(lookalikes)
 
     def __len__(self) -> int:
         """m, the number of keypoints."""
@@ -170,6 +192,41 @@ class KeypointChain:
             margins.append(torch.minimum(margin, margins[self.reference[i]]))
         return torch.stack(chosen[1:], -2), torch.stack(margins[1:], -1)
 
+    def nearest(self, points: Tensor, template: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The label keypoints of surface points under the rule `point`.
+
+        Args:
+            points: (..., 3), template: (..., m, 3) canonical keypoints, part frame, metres.
+        Returns:
+            keypoints (..., m, 3) and margin (..., m) as `choose` has them, then exchanged; and which of the
+            `lookalikes` (...) int64.
+        """
+        keypoints, margin = self.choose(NearestToPoint(points), template)
+        if len(self.lookalikes) == 1:
+            return keypoints, margin, torch.zeros_like(margin[..., 0], dtype=torch.int64)
+        first = self.lookalikes[:, 0].to(points.device)
+        distance = torch.linalg.vector_norm(keypoints[..., first, :] - points[..., None, :], dim=-1)
+        which, lead = first_by([distance], torch.ones_like(distance, dtype=torch.bool))
+        order = self.lookalikes.to(points.device)
+        moved = (order != order[0]).any(0)
+        margin = margin.gather(-1, order[which])
+        margin = torch.where(moved, torch.minimum(margin, lead[..., None]), margin)
+        return self.exchanged(keypoints, which), margin, which
+
+    def without_lookalikes(self) -> "KeypointChain":
+        """The same keypoints, of which none are exchanged."""
+        plain = copy(self)
+        plain.lookalikes = self.lookalikes[:1]
+        return plain
+
+    def exchanged(self, values: Tensor, which: Tensor) -> Tensor:
+        """What is said of the keypoints (..., m, c), exchanged by one of the lookalikes (...); twice is
+        undone."""
+        if len(self.lookalikes) == 1:
+            return values
+        order = converted(self.lookalikes, which)[which]
+        return values.gather(-2, order[..., None].expand(*order.shape, values.shape[-1]))
+
     def parameters_from_keypoints(self, centroid: Tensor, keypoints: Tensor) -> Tensor:
         """Parameters measured between keypoints (the module M_P).
 
@@ -263,6 +320,40 @@ class KeypointChain:
                 direction = judge.on_sphere(start)[..., None, :].expand_as(centre)
         near, far = (centre + sign * radius[..., None] * direction for sign in (1, -1))
         return near, (judge.keys(far)[0] - judge.keys(near)[0]).clamp(min=0) / 2
+
+    def _permutations(self, exchanges: Sequence[Exchange]) -> Tensor:
+        """(q, m) int64; the first exchanges nothing."""
+        orders = [list(range(len(self))), *(self._order(exchange) for exchange in exchanges)]
+        if len({order[0] for order in orders}) < len(orders):
+            raise ValueError(
+                f"lookalikes: every exchange must bring another keypoint to the place of {self.names[0]!r}, "
+                "which tells them apart; leave out what does not, or declare another keypoint first"
+            )
+        for one, other in product(orders, repeat=2):
+            if [one[i] for i in other] not in orders:
+                names = ", ".join(self.names[one[i]] for i in other)
+                raise ValueError(
+                    f"lookalikes: two exchanges after one another bring ({names}) to the places of "
+                    f"({', '.join(self.names)}), which is no exchange of the list; add it"
+                )
+        return torch.tensor(orders)
+
+    def _order(self, exchange: Exchange) -> list[int]:
+        """Which keypoint stands at each place."""
+        finite = [name for name, is_finite in zip(self.names, self.is_finite, strict=True) if is_finite]
+        for name in chain.from_iterable(exchange):
+            if name not in finite:
+                raise ValueError(
+                    f"lookalikes exchange {name!r}, which is none of the keypoints that have finitely many "
+                    f"equivalents: {', '.join(finite) or 'there are none'}"
+                )
+        order = list(range(len(self)))
+        for one, other in exchange:
+            i, j = self.names.index(one), self.names.index(other)
+            order[i], order[j] = j, i
+        if [order[i] for i in order] != list(range(len(self))):
+            raise ValueError(f"lookalikes: {exchange} exchanges a keypoint twice; name it in one pair")
+        return order
 
     def _find_finite(self) -> list[bool]:
         finite = [True]

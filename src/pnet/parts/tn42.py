@@ -24,7 +24,15 @@ class TN42(ParametricPart):
         Keypoint("foot", "centroid", Corner((0, 0, 0))),  # middle of the large end's lower edge
         Keypoint("toe", "foot", Plane("x"), "l"),
         Keypoint("head", "foot", Plane("z"), "a"),
+        Keypoint("tip", "toe", Plane("z", at=1000 * SMALL_END)),  # the small end's upper edge
         Keypoint("side", "centroid", Plane("y"), "w", factor=0.5),
+    )
+
+    # turned end for end, side for side, or both, it looks much as before: only the taper tells
+    lookalikes = (
+        (("foot", "toe"), ("head", "tip")),
+        (("foot", "head"), ("toe", "tip")),
+        (("foot", "tip"), ("toe", "head")),
     )
 
     def check(self, parameters: Points) -> None:

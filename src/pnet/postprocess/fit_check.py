@@ -27,7 +27,7 @@ def fit_error(part: ParametricPart, rule: KeypointRule, samples: int, seed: int 
         template = part.chain.keypoints_from_parameters(parameters)
         reach = torch.linalg.vector_norm(template, dim=-1).amax(-1, keepdim=True)
         points = reach * torch.nn.functional.normalize(direction, dim=-1)
-        local, _ = part.chain.choose(NearestToPoint(points), template)
+        local = part.chain.choose(NearestToPoint(points), template)[0]
     else:
         local, _ = part.chain.select(KeypointChoice(rule), parameters, R)
     found_R, found_t = fit_pose(part.chain, parameters, t, apply_pose(R, t, local))

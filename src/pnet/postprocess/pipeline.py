@@ -1,6 +1,6 @@
 """The whole right half of the paper's Fig. 5."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -10,13 +10,16 @@ from pnet.parts.base import ParametricPart
 from pnet.postprocess.batches import in_batches, sound_points
 from pnet.postprocess.cluster import CentroidClusters
 from pnet.postprocess.detections import by_scene, no_detections, on_cpu
-from pnet.postprocess.fit import fit_pose
+from pnet.postprocess.fit import fit_template
+from pnet.postprocess.folded_vote import FoldedVote
 from pnet.postprocess.grouping import Clusters, clusters_of
 from pnet.postprocess.icp import IcpRefinement, refined
 from pnet.postprocess.radius_filter import RadiusFilter
 from pnet.postprocess.score import instance_score, sure_enough
-from pnet.postprocess.vote import PointVotes, Voting
+from pnet.postprocess.vote import InstanceVotes, PointVotes, Voting
 from pnet.records import Detections, PointPrediction
+
+LEFT_OUT = -1.0  # in place of the score of an instance that is seen too little of
 
 
 @dataclass(frozen=True)
@@ -30,10 +33,13 @@ class PoseRecovery:
         scene_parameters: average the parameters over the scene's best visible instances, as the released
             code does: right where a scene holds one part object. best_visible: those whose visibility
             exceeds this share of the scene's highest.
-        trust: keypoints are weighted in the fit by 1 / (s² + trust²), s the spread of their votes and
-            `trust` the error of votes that agree, metres. None: equal weights, as equation 6 has it. Where
-            a label is ambiguous (a flat ring seen along its axis has no nearest rim point) votes disagree
-            and their mean is far from every equivalent; the weight keeps it from dragging the pose along.
+        trust: keypoints are weighted in the fit by 1 / (s² + trust²), s² the square of the spread of their
+            votes and that of the network's doubt together, `trust` the error of votes that agree, metres.
+            None: equal weights, as equation 6 has it. Where a label is ambiguous (a flat ring seen along
+            its axis has no nearest rim point) votes disagree and their mean is far from every equivalent;
+            the weight keeps it from dragging the pose along.
+        doubtful: an instance's score falls by a factor of e where its keypoints are expected to be off by
+            this share of the largest distance of a keypoint from the centroid; None: it doesn't.
         refine: ICP against the cloud, or None.
     """
 
@@ -44,7 +50,12 @@ class PoseRecovery:
     scene_parameters: bool
     best_visible: float
     trust: float | None
+    doubtful: float | None = None
     refine: IcpRefinement | None = None
+
+    def __post_init__(self) -> None:
+        if self.doubtful is not None and self.doubtful <= 0:
+            raise ValueError(f"postprocess.doubtful is {self.doubtful}, expected a positive share or null")
 
     def __call__(
         self, part: ParametricPart, prediction: PointPrediction, points: Tensor | None = None
@@ -59,23 +70,31 @@ class PoseRecovery:
             raise ValueError("postprocess.refine needs the scenes' points")
         return in_batches(partial(self._recover, part), prediction, points)
 
+    def without_lookalikes(self) -> "PoseRecovery":
+        """The same for a network whose labels were exchanged nowhere."""
+        if not isinstance(self.voting, FoldedVote):
+            return self
+        return replace(self, voting=replace(self.voting, lookalikes=False))
+
     def _recover(
         self, part: ParametricPart, prediction: PointPrediction, points: Tensor | None
     ) -> list[Detections]:
-        said = prediction.keypoints, prediction.visibility
+        said = prediction.keypoints, prediction.visibility, prediction.doubt, prediction.parameters
         clusters = clusters_of(self.cluster(prediction.centroid, sound_points(*said)))
         if not len(clusters.groups):
             return [no_detections(part, len(own)) for own in clusters.owner]
         score = instance_score(prediction.visibility, clusters)
         agreed = self.voting(part, self._votes(prediction, clusters))
-        parameters = self._sizes(part, agreed.parameters, score, clusters.scenes)
-        weight = None if self.trust is None else 1 / (agreed.spread.square() + self.trust**2)
-        R, t = fit_pose(part.chain, parameters, agreed.centroid, agreed.keypoints, weight)
+        parameters = self._sizes(part, agreed, score, clusters.scenes)
+        template = part.chain.keypoints_from_parameters(parameters)
+        sure = sure_enough(score, prediction.visibility, self.visibility_threshold)
+        # the mark travels with the score: one transfer from the device less
+        score = torch.where(sure, self._confidence(agreed, template, score), LEFT_OUT)
+        R, t = fit_template(part.chain, template, agreed.centroid, agreed.keypoints, self._weight(agreed))
         found = on_cpu(Detections(R, t, parameters, score, agreed.keypoints, clusters.owner))
         if self.refine is not None and points is not None:
             found = refined(self.refine, part, found, points)
-        sure = sure_enough(found.score, prediction.visibility, self.visibility_threshold)
-        return by_scene(found, sure, clusters.scenes)
+        return by_scene(found, found.score > LEFT_OUT, clusters.scenes)
 
     def _votes(self, prediction: PointPrediction, clusters: Clusters) -> PointVotes:
         """What the clustered points say, and whose word the radius filter takes."""
@@ -89,21 +108,47 @@ class PoseRecovery:
             reliable = torch.ones_like(places[..., 0], dtype=torch.bool)
         else:
             reliable = self.radius_filter(places, clusters.groups)
-        return PointVotes(centroid, keypoints, clusters.groups, reliable)
+        doubt, sizes = (
+            None if said is None else clusters.of(said).double()
+            for said in (prediction.doubt, prediction.parameters)
+        )
+        return PointVotes(centroid, keypoints, clusters.groups, reliable, doubt, sizes)
 
-    def _sizes(self, part: ParametricPart, parameters: Tensor, score: Tensor, scenes: list[int]) -> Tensor:
+    def _weight(self, agreed: InstanceVotes) -> Tensor | None:
+        """(d, 1 + m) of the centroid and the keypoints in the fit."""
+        if self.trust is None:
+            return None
+        variance = agreed.spread.square() + self.trust**2
+        if agreed.doubt is not None:
+            variance = variance + agreed.doubt[:, : variance.shape[1]].square()
+        return 1 / variance
+
+    def _confidence(self, agreed: InstanceVotes, template: Tensor, score: Tensor) -> Tensor:
+        """(d,) score, lower where the keypoints are expected to be off by much of the part's size."""
+        if agreed.doubt is None or self.doubtful is None:
+            return score
+        size = torch.linalg.vector_norm(template, dim=-1).amax(-1)
+        off = agreed.doubt[:, : agreed.spread.shape[1]].square().mean(-1).sqrt()
+        return score * torch.exp(-off / (self.doubtful * size))
+
+    def _sizes(self, part: ParametricPart, agreed: InstanceVotes, score: Tensor, scenes: list[int]) -> Tensor:
         """(d, k) the part's own where it has one size only, else those voted, each or by scene."""
+        parameters = agreed.parameters
         if part.is_fixed:
             return torch.from_numpy(part.grids["L"][0]).to(parameters).expand_as(parameters).clone()
         if not self.scene_parameters:
             return parameters
         # small numbers, which the CPU adds up in the same order for any device
-        known = zip(*(x.split(scenes) for x in (parameters.cpu(), score.cpu())), strict=True)
+        doubt = (
+            torch.ones_like(parameters) if agreed.doubt is None else agreed.doubt[:, 1 + len(part.chain) :]
+        )
+        known = zip(*(x.cpu().split(scenes) for x in (parameters, score, doubt)), strict=True)
         return torch.cat([self._shared(*own) for own in known]).to(parameters)
 
-    def _shared(self, parameters: Tensor, score: Tensor) -> Tensor:
-        """(d, k) the mean parameters of one scene's best visible instances, for all."""
+    def _shared(self, parameters: Tensor, score: Tensor, doubt: Tensor) -> Tensor:
+        """(d, k) the mean parameters of one scene's best visible instances, for all; the surer count more."""
         if not len(score):
             return parameters
         best = score >= self.best_visible * score.max()
-        return parameters[best].mean(0).expand_as(parameters)
+        weight = 1 / doubt[best].square()
+        return ((weight * parameters[best]).sum(0) / weight.sum(0)).expand_as(parameters)

@@ -19,12 +19,16 @@ class PointVotes:
         centroid: (M, 3), keypoints: (M, m, 3) camera frame, metres. groups: how they stand.
         reliable: (M, 1 + m) bool: which votes for the centroid and each keypoint count, at least one a
             cluster; (M, 1) for a voting that weighs keypoints in its own way.
+        doubt: (M, 1 + m + k), parameters: (M, k) metres, see `PointPrediction`; None where the network has no
+            such head.
     """
 
     centroid: Tensor
     keypoints: Tensor
     groups: Groups
     reliable: Tensor
+    doubt: Tensor | None = None
+    parameters: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,12 +38,15 @@ class InstanceVotes:
     Attributes:
         centroid: (d, 3), keypoints: (d, m, 3) camera frame, metres. parameters: (d, k) metres.
         spread: (d, 1 + m) root mean square distance of the counted votes from it, metres.
+        doubt: (d, 1 + m + k) how far off centroid, keypoints and parameters are expected to be, metres, or
+            None where the network does not say.
     """
 
     centroid: Tensor
     keypoints: Tensor
     parameters: Tensor
     spread: Tensor
+    doubt: Tensor | None = None
 
 
 class Voting(Protocol):
@@ -68,8 +75,11 @@ class MeanVote:
         targets = torch.cat([votes.centroid[:, None], votes.keypoints], 1)
         places = vote(targets, votes.groups, votes.reliable)
         spread = vote_spread(targets, votes.groups, places, votes.reliable)
-        per_point = part.chain.parameters_from_keypoints(votes.centroid, votes.keypoints)
-        return InstanceVotes(places[:, 0], places[:, 1:], vote(per_point, votes.groups), spread)
+        per_point = votes.parameters
+        if per_point is None:
+            per_point = part.chain.parameters_from_keypoints(votes.centroid, votes.keypoints)
+        doubt = None if votes.doubt is None else vote(votes.doubt, votes.groups)
+        return InstanceVotes(places[:, 0], places[:, 1:], vote(per_point, votes.groups), spread, doubt)
 
 
 def vote(values: Tensor, groups: Groups, kept: Tensor | None = None) -> Tensor:

@@ -193,8 +193,12 @@ def runs_table(table: PaperTable) -> Table:
     return grid
 
 
-def markdown(table: PaperTable) -> str:
-    """For a page: the warnings, the table, its caption, what is missing, and what stands behind."""
+def markdown(table: PaperTable, below: str = "") -> str:
+    """For a page: the warnings, the table, its caption, what is missing, and what stands behind.
+
+    Args:
+        below: further sections, in Markdown; they follow the caption.
+    """
     headings = (table.corner, *(column.title for column in table.columns))
     rows = [
         (row.title, *(" ".join(filter(None, cell_texts(row, cell))) for cell in row.cells))
@@ -204,10 +208,11 @@ def markdown(table: PaperTable) -> str:
     parts = [
         f"## {_escaped(table.heading)}",
         _section("Note", _bullets(table.warnings)),
-        _pipe_table(headings, rows, "---:"),
+        pipe_table(headings, rows, "---:"),
         "\\\n".join(_escaped(line) for line in table.caption),  # the backslash breaks the line
+        below,
         _section("Missing", _bullets(table.missing)),
-        _section("What stands behind", _pipe_table(RUN_HEADINGS, runs, "---") if runs else ""),
+        _section("What stands behind", pipe_table(RUN_HEADINGS, runs, "---") if runs else ""),
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -273,6 +278,13 @@ def duration_text(seconds: float | None) -> str:
     return f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
+def pipe_table(headings: Sequence[str], rows: Sequence[Sequence[str]], alignment: str) -> str:
+    """A table in Markdown, its first column to the left. alignment: of the others, "---:" to the right."""
+    rule = ["---", *([alignment] * (len(headings) - 1))]
+    texts = [[_escaped(text) for text in row] for row in (headings, *rows)]
+    return "\n".join(f"| {' | '.join(row)} |" for row in (texts[0], rule, *texts[1:]))
+
+
 def _check(place: str, origin: str, cell: Cell) -> None:
     published = () if cell.published is None else (cell.published,)
     for value in (*cell.values, *published):
@@ -310,12 +322,6 @@ def _section(heading: str, content: str) -> str:
 
 def _bullets(lines: Iterable[str]) -> str:
     return "\n".join(f"- {_escaped(line)}" for line in lines)
-
-
-def _pipe_table(headings: Sequence[str], rows: Sequence[Sequence[str]], alignment: str) -> str:
-    rule = ["---", *([alignment] * (len(headings) - 1))]
-    texts = [[_escaped(text) for text in row] for row in (headings, *rows)]
-    return "\n".join(f"| {' | '.join(row)} |" for row in (texts[0], rule, *texts[1:]))
 
 
 def _escaped(text: str) -> str:

@@ -49,12 +49,7 @@ def scene_picture(scene: Scene, detections: Detections, part: ParametricPart, pa
         part: the template of both. path: where to write; the folder must exist.
     """
     found = detected_bodies(part, _SECTIONS, detections)
-    instance = detections.instance.cpu().numpy()
-    points = scene.points[: len(instance)].astype(np.float64)
-    camera = crop(scene.camera, points, np.asarray(found.mesh.vertices))
-    figure = Figure(figsize=(SIZE[0] / 100, SIZE[1] / 100), dpi=100, facecolor=BACKGROUND)
-    left, right = (pixel_axes(figure, (x, 64), (PANEL, PANEL)) for x in (8, SIZE[0] - PANEL - 8))
-    draw_cloud(left, camera, points, point_colours(instance, len(detections.score)))
+    figure, _, right, camera, points = two_panels(scene, detections, found)
     image, depth = render_bodies(camera, found, instance_colours(len(detections.score)))
     draw_image(right, image)
     _draw_unexplained(right, camera, points, depth)
@@ -62,6 +57,23 @@ def scene_picture(scene: Scene, detections: Detections, part: ParametricPart, pa
     draw_axes(right, camera, axes)
     _caption(figure, *caption_texts(scene, detections, found.missing, len(axes)))
     write_png(figure, path)
+
+
+def two_panels(
+    scene: Scene, detections: Detections, found: Bodies
+) -> tuple[Figure, Axes, Axes, Camera, Points]:
+    """A figure with the clustered cloud on the left.
+
+    Returns:
+        the figure, its left and right axes, the camera of both, and the points (N, 3) that were clustered.
+    """
+    instance = detections.instance.cpu().numpy()
+    points = scene.points[: len(instance)].astype(np.float64)
+    camera = crop(scene.camera, points, np.asarray(found.mesh.vertices))
+    figure = Figure(figsize=(SIZE[0] / 100, SIZE[1] / 100), dpi=100, facecolor=BACKGROUND)
+    left, right = (pixel_axes(figure, (x, 64), (PANEL, PANEL)) for x in (8, SIZE[0] - PANEL - 8))
+    draw_cloud(left, camera, points, point_colours(instance, len(detections.score)))
+    return figure, left, right, camera, points
 
 
 def crop(camera: Camera, points: Points, vertices: Points) -> Camera:

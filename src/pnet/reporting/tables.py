@@ -1,7 +1,7 @@
 """What each metric is called, in which unit it is shown and what it means; and the table of a run."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from rich.table import Table
@@ -77,6 +77,7 @@ HEADLINE = (
     "parameter_error_mm",
     "seconds",
 )
+_ONE = "parameter_error_mm/"  # before the name of a parameter: the error of it alone
 
 
 def metrics_table(metrics: Mapping[str, float | None]) -> Table:
@@ -90,8 +91,8 @@ def metrics_table(metrics: Mapping[str, float | None]) -> Table:
     table.add_column("metric", no_wrap=True)
     table.add_column("value", justify="right", no_wrap=True)
     table.add_column("meaning", style="dim")
-    known = [key for key in METRICS if key in metrics]
-    for key in [*known, *(key for key in metrics if key not in METRICS)]:
+    known = [key for key in _with_each(METRICS, metrics) if key in metrics]
+    for key in dict.fromkeys([*known, *metrics]):
         label, value, explanation = metric_row(key, metrics[key])
         table.add_row(label, value, explanation)
     return table
@@ -104,12 +105,23 @@ def headline_rows(metrics: Mapping[str, float | None]) -> list[tuple[str, str, s
 
 def metric_row(key: str, value: float | None) -> tuple[str, str, str]:
     """Name, value text and explanation of one metric."""
-    metric = METRICS.get(key, Metric(key, ""))
+    metric = METRICS.get(key) or (_one_parameter(key) if key.startswith(_ONE) else Metric(key, ""))
     return metric.label, metric.text(value), metric.explanation
+
+
+def _one_parameter(key: str) -> Metric:
+    name = key.removeprefix(_ONE)
+    return Metric(f"Parameter error, {name}", f"Mean error of dimension {name} of found bodies.", " mm", 2)
+
+
+def _with_each(keys: Iterable[str], metrics: Iterable[str]) -> list[str]:
+    """Keys, those of each parameter that are given after the one of all."""
+    each = [key for key in metrics if key.startswith(_ONE)]
+    return [k for key in keys for k in (key, *(each if key == "parameter_error_mm" else ()))]
 
 
 def _headline(metrics: Mapping[str, float | None]) -> dict[str, float | None]:
     parts = [metrics.get("network_seconds"), metrics.get("postprocess_seconds")]
     given = [part for part in parts if part is not None]
     together = {"seconds": sum(given) if len(given) == len(parts) else None}
-    return {key: {**metrics, **together}.get(key) for key in HEADLINE}
+    return {key: {**metrics, **together}.get(key) for key in _with_each(HEADLINE, metrics)}

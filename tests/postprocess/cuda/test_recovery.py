@@ -61,7 +61,7 @@ def batch(tn06, make_scene) -> PointPrediction:
     both = [say(tn06, make_scene(tn06, bodies, 60, seed), seed) for bodies, seed in ((3, 0), (2, 1))]
     wrong = replace(both[0], centroid=both[0].centroid * torch.nan)
     rows = zip(*(vars(scene).values() for scene in (both[0], wrong, both[1])), strict=True)
-    return PointPrediction(*map(torch.cat, rows))
+    return PointPrediction(*(None if row[0] is None else torch.cat(row) for row in rows))
 
 
 def moved(prediction, here):
@@ -113,8 +113,9 @@ def test_how_often_the_host_waits_does_not_depend_on_scenes_or_clusters(here, tn
     for name in WAITS:
         count(name)
     recovery = replace(MEAN, radius_filter=None, scene_parameters=False)
+    last = PointPrediction(batch.centroid[2:], batch.keypoints[2:], batch.visibility[2:])
     with only(Kernels.TRITON):
-        for scenes in (batch, PointPrediction(*(value[2:] for value in vars(batch).values()))):
+        for scenes in (batch, last):
             counts.append(0)
             recovery(tn06, moved(scenes, here))
     assert counts == [4, 4]  # for the number of seeds, of clusters; for the instances, the points' numbers
