@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from pnet.geometry.camera import Camera
 from pnet.geometry.rigid import apply_inverse_pose, rotation_angle
 from pnet.geometry.symmetry import nearest_equivalent
-from pnet.postprocess.icp import MAX_TURN, IcpRefinement, Surface, _Target, residual, sample_surface
+from pnet.postprocess.icp import MAX_TURN, IcpRefinement, _Target, residual
+from pnet.postprocess.surface import Surface, sample_surface
 from pnet.scenes.rendering import render_view
 
 REFINE = IcpRefinement(model_points=2000, max_distance=0.005, iterations=30, min_points=20)

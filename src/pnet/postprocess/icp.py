@@ -1,8 +1,8 @@
 """Refinement of poses against the cloud by generalised ICP (Segal et al., RSS 2009), with small_gicp."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from torch import Tensor
 from pnet.geometry.rigid import rotation_angle
 from pnet.geometry.symmetry import nearest_equivalent
 from pnet.parts.base import ParametricPart, Points
+from pnet.postprocess.surface import Surface, sample_surface
 from pnet.records import Detections
 
 Pose = tuple[Points, Points]
@@ -22,7 +23,6 @@ ROUNDS = 2  # registrations, each from the last one's pose and without the stray
 STRAY = 4.5  # medians of the distance to the surface beyond which a point is a stray: 3 σ of Gaussian noise
 CLOSE = 0.05  # no point is a stray within this share of max_distance: without noise the median is nothing
 TRUSTED = 0.8  # share of a cluster's points that judge a pose: the nearest to the surface
-GRAZING = math.sin(math.radians(10))  # faces turned away by less may be seen, as the pose is not exact yet
 MAX_TURN = math.radians(15)  # a larger turn is another fit, not a refinement
 STEP = {"rotation_epsilon": 1e-4, "translation_epsilon": 1e-6}  # radians, metres; smaller ones are the last
 
@@ -81,7 +81,15 @@ class IcpRefinement:
                     R[i], t[i] = self._plausible(part, R[i], t[i], *map(torch.from_numpy, found))
         return R, t
 
-    def _fit(self, gicp: Any, surface: "Surface", R: Points, t: Points, own: Points) -> Pose | None:
+    def refined(
+        self, part: ParametricPart, found: Detections, points: Tensor, scenes: Sequence[int]
+    ) -> Detections:
+        """See `Refinement`: better poses, the rest as it is."""
+        cloud, owner = points.flatten(0, 1).cpu().double(), found.instance.flatten()
+        R, t = self(part, found.parameters, found.R, found.t, cloud, owner)
+        return replace(found, R=R, t=t)
+
+    def _fit(self, gicp: Any, surface: Surface, R: Points, t: Points, own: Points) -> Pose | None:
         """The pose of one cluster (n, 3) where its residual is lower than at R (3, 3), t (3,), else None.
 
         A registration finds Q, q that carry the cluster in the part frame, x = Rᵀ (p − t), to Q x + q on the
@@ -127,55 +135,10 @@ class IcpRefinement:
         return move[:3, :3], move[:3, 3]
 
 
-def refined(refine: IcpRefinement, part: ParametricPart, found: Detections, points: Tensor) -> Detections:
-    """The instances of all scenes with better poses.
-
-    Args:
-        found: (d) instances, their points' numbers (B, N) among them. points: (B, N, 3) camera frame, metres.
-    """
-    cloud, owner = points.flatten(0, 1).cpu().double(), found.instance.flatten()
-    R, t = refine(part, found.parameters, found.R, found.t, cloud, owner)
-    return replace(found, R=R, t=t)
-
-
 def _by_owner(cloud: Points, owner: NDArray[np.int64], d: int) -> list[Points]:
     """The points (n, 3) of each of d clusters, in their order. owner: (n,) cluster, −1 for none."""
     order = np.argsort(owner, kind="stable")
     return np.split(cloud[order], np.searchsorted(owner[order], np.arange(d + 1)))[1:-1]
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """Samples of a surface.
-
-    Attributes:
-        points: (n, 3) part frame, metres. normals: (n, 3) outward unit vectors.
-    """
-
-    points: Points
-    normals: Points
-
-    def facing(self, R: Points, t: Points) -> "Surface":
-        """Those that the pose R (3, 3), t (3,) part → camera turns to the camera."""
-        ray = self.points + t @ R  # from the camera, in the part frame
-        turned = (ray * self.normals).sum(1) < GRAZING * np.linalg.norm(ray, axis=1)
-        return Surface(self.points[turned], self.normals[turned])
-
-
-@lru_cache(maxsize=256)  # a scene's instances, or a data set's, share their sizes
-def sample_surface(part: ParametricPart, parameters: tuple[float, ...], count: int) -> Surface | None:
-    """So many samples, the same every time, of a part of these parameters (k), metres.
-
-    Returns:
-        None where no such part is possible, as estimates may have it.
-    """
-    try:
-        part.check_named(np.array(parameters))
-        mesh = part.mesh(np.array(parameters))
-    except ValueError:
-        return None
-    points, face = mesh.sample(count, return_index=True, seed=0)
-    return Surface(np.asarray(points, np.float64), np.asarray(mesh.face_normals[face], np.float64))
 
 
 class _Target:

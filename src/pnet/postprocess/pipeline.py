@@ -13,8 +13,8 @@ from pnet.postprocess.detections import by_scene, no_detections, on_cpu
 from pnet.postprocess.fit import fit_template
 from pnet.postprocess.folded_vote import FoldedVote
 from pnet.postprocess.grouping import Clusters, clusters_of
-from pnet.postprocess.icp import IcpRefinement, refined
 from pnet.postprocess.radius_filter import RadiusFilter
+from pnet.postprocess.refinement import Refinement
 from pnet.postprocess.score import instance_score, sure_enough
 from pnet.postprocess.vote import InstanceVotes, PointVotes, Voting
 from pnet.records import Detections, PointPrediction
@@ -40,7 +40,7 @@ class PoseRecovery:
             the weight keeps it from dragging the pose along.
         doubtful: an instance's score falls by a factor of e where its keypoints are expected to be off by
             this share of the largest distance of a keypoint from the centroid; None: it doesn't.
-        refine: ICP against the cloud, or None.
+        refine: fits poses, or sizes too, to the cloud; None: they stay.
     """
 
     cluster: CentroidClusters
@@ -51,7 +51,7 @@ class PoseRecovery:
     best_visible: float
     trust: float | None
     doubtful: float | None = None
-    refine: IcpRefinement | None = None
+    refine: Refinement | None = None
 
     def __post_init__(self) -> None:
         if self.doubtful is not None and self.doubtful <= 0:
@@ -93,7 +93,7 @@ class PoseRecovery:
         R, t = fit_template(part.chain, template, agreed.centroid, agreed.keypoints, self._weight(agreed))
         found = on_cpu(Detections(R, t, parameters, score, agreed.keypoints, clusters.owner))
         if self.refine is not None and points is not None:
-            found = refined(self.refine, part, found, points)
+            found = self.refine.refined(part, found, points, clusters.scenes)
         return by_scene(found, found.score > LEFT_OUT, clusters.scenes)
 
     def _votes(self, prediction: PointPrediction, clusters: Clusters) -> PointVotes:

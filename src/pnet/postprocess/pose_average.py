@@ -15,7 +15,7 @@ from pnet.postprocess.batches import in_batches, sound_points
 from pnet.postprocess.cluster import CentroidClusters
 from pnet.postprocess.detections import by_scene, no_detections, on_cpu
 from pnet.postprocess.grouping import clusters_of
-from pnet.postprocess.icp import IcpRefinement, refined
+from pnet.postprocess.refinement import Refinement
 from pnet.postprocess.score import instance_score, sure_enough
 from pnet.postprocess.vote import vote
 from pnet.records import Detections, PosePrediction
@@ -34,14 +34,14 @@ class PoseAveraging:
         visibility_threshold: points, and instances, with a lower visibility are left out.
         votes: the most points of a cluster whose rotations are averaged.
         width: angle from the mean at which a rotation no longer counts, degrees; 180: all count.
-        refine: ICP against the cloud, or None.
+        refine: fits poses, or sizes too, to the cloud; None: they stay.
     """
 
     cluster: CentroidClusters
     visibility_threshold: float
     votes: int
     width: float
-    refine: IcpRefinement | None = None
+    refine: Refinement | None = None
 
     def __call__(
         self, part: ParametricPart, prediction: PosePrediction, points: Tensor | None = None
@@ -70,13 +70,13 @@ class PoseAveraging:
         parameters = known_parameters(part, len(groups))
         unknown = t.new_full((len(groups), len(part.chain), 3), math.nan)
         score = instance_score(prediction.visibility, clusters)
+        sure = sure_enough(score, prediction.visibility, self.visibility_threshold).cpu()
         found = on_cpu(Detections(R, t, parameters.to(t), score, unknown, clusters.owner))
         if self.refine is not None and points is not None:
-            found = refined(self.refine, part, found, points)
-        if not bool(parameters.isnan().any()):  # parts need not bear NaN
-            places = part.chain.keypoints_from_parameters(parameters)
+            found = self.refine.refined(part, found, points, clusters.scenes)
+        if not bool(found.parameters.isnan().any()):  # parts need not bear NaN
+            places = part.chain.keypoints_from_parameters(found.parameters)
             found = replace(found, keypoints=apply_pose(found.R, found.t, places))
-        sure = sure_enough(found.score, prediction.visibility, self.visibility_threshold)
         return by_scene(found, sure, clusters.scenes)
 
     def _seen(self, prediction: PosePrediction) -> Tensor:

@@ -1,0 +1,45 @@
+"""Samples of a part's surface, onto which clouds are registered."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from pnet.parts.base import ParametricPart, Points
+
+GRAZING = math.sin(math.radians(10))  # faces turned away by less may be seen, as the pose is not exact yet
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Samples of a surface.
+
+    Attributes:
+        points: (n, 3) part frame, metres. normals: (n, 3) outward unit vectors.
+    """
+
+    points: Points
+    normals: Points
+
+    def facing(self, R: Points, t: Points) -> "Surface":
+        """Those that the pose R (3, 3), t (3,) part → camera turns to the camera."""
+        ray = self.points + t @ R  # from the camera, in the part frame
+        turned = (ray * self.normals).sum(1) < GRAZING * np.linalg.norm(ray, axis=1)
+        return Surface(self.points[turned], self.normals[turned])
+
+
+@lru_cache(maxsize=1024)  # a scene's instances, or a data set's, share their sizes
+def sample_surface(part: ParametricPart, parameters: tuple[float, ...], count: int) -> Surface | None:
+    """So many samples, the same every time, of a part of these parameters (k), metres.
+
+    Returns:
+        None where no such part is possible, as estimates may have it.
+    """
+    try:
+        part.check_named(np.array(parameters))
+        mesh = part.mesh(np.array(parameters))
+    except ValueError:
+        return None
+    points, face = mesh.sample(count, return_index=True, seed=0)
+    return Surface(np.asarray(points, np.float64), np.asarray(mesh.face_normals[face], np.float64))

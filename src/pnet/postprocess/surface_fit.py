@@ -1,0 +1,253 @@
+"""Poses and sizes of a scene fitted to its cloud, together.
+
+Votes say where keypoints are, not what was seen. Here the surface of the template itself is laid onto each
+instance's points, in the pose that was voted and in those that look much like it; and as all instances of a
+scene are one part object, the size under which all of them together explain the cloud best is theirs.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import permutations, product
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pnet.geometry.rigid import rotation_angle
+from pnet.geometry.symmetry import nearest_equivalent
+from pnet.parts.base import ParametricPart
+from pnet.postprocess.grouping import clusters_of
+from pnet.postprocess.surface import Surface, sample_surface
+from pnet.postprocess.surface_registration import FreeSpace, OwnPoints, misfit, register
+from pnet.records import Detections
+
+ROUNDS = 3  # each parameter is tried up and down at most so often with one step
+FEW = 2  # steps of a registration for another size
+WIDE = 0.001  # metres: after sizes have changed in steps of this, other poses are tried again
+SAME = 0.1  # radians between rotations that count as one
+Size = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class SurfaceFit:
+    """Registers each instance onto the template's surface and finds the size that fits all of them.
+
+    Nothing is asked of the network but instances near their place: the sizes may be some millimetres off,
+    and the pose one of those that are hard to tell apart. Where a method says no size the search starts in
+    the middle of the part's learning grid.
+
+    Attributes:
+        samples: of the part's surface. points: the most points of an instance that count.
+        steps: of a registration. reach: what is farther off the surface counts as so far, metres.
+        slack: distances that noise and the gaps between points leave open, metres.
+        free: weight of surface where the camera saw through it.
+        alike: turns by quarters about the part's axes are tried too where the surface comes to lie on itself
+            to within this share of its radius; 0: none.
+        sizes: steps by which parameters are changed, metres, in turn; none: they stay.
+        shared: whether the instances of a scene are one part object; false: each has its own size.
+        hold: misfit that a change of the sizes must save, a metre of change.
+        doubtful: misfit by which the score falls by a factor of e, metres; None: it stays.
+    """
+
+    samples: int
+    points: int
+    steps: int
+    reach: float
+    slack: float
+    free: float
+    alike: float
+    sizes: Sequence[float]
+    shared: bool
+    hold: float
+    doubtful: float | None
+
+    def __post_init__(self) -> None:
+        for name in ("samples", "points", "steps", "reach", "slack", "doubtful"):
+            value = getattr(self, name)
+            if value is not None and value <= 0:
+                raise ValueError(f"postprocess.refine.{name} is {value}, expected a positive number")
+        if any(step <= 0 for step in self.sizes):
+            raise ValueError(
+                f"postprocess.refine.sizes is {list(self.sizes)}, expected positive steps in metres, or []"
+            )
+
+    def refined(
+        self, part: ParametricPart, found: Detections, points: Tensor, scenes: Sequence[int]
+    ) -> Detections:
+        """See `Refinement`; poses, sizes and scores are new. Instances of negative score stay."""
+        clusters = clusters_of(found.instance)
+        cloud = points.detach().cpu().double()
+        member, valid = clusters.groups.first(self.points)
+        own = OwnPoints(clusters.of(cloud)[member], valid.double())
+        R, t, sizes, score = (x.clone() for x in (found.R, found.t, found.parameters, found.score))
+        end = torch.tensor([0, *scenes]).cumsum(0).tolist()
+        for i, seen in enumerate(cloud):
+            these = torch.arange(end[i], end[i + 1])
+            these = these[score[these] >= 0]
+            if not len(these):
+                continue
+            free = FreeSpace(seen, self.slack)
+            for some in (these,) if self.shared else these.split(1):
+                fit = _Fit(self, part, own.of(some), free, score[some])
+                R[some], t[some], sizes[some], score[some] = fit(R[some], t[some], sizes[some])
+        return replace(found, R=R, t=t, parameters=sizes, score=score)
+
+
+@dataclass(frozen=True, eq=False)
+class _Poses:
+    """R (d, 3, 3), t (d, 3) part → camera, and how badly each explains the cloud, off (d,); metres."""
+
+    R: Tensor
+    t: Tensor
+    off: Tensor
+
+
+class _Fit:
+    """Some instances of one part object.
+
+    Args:
+        own: their d points each. score: (d,) how much each of them counts for the size.
+    """
+
+    def __init__(
+        self, settings: SurfaceFit, part: ParametricPart, own: OwnPoints, free: FreeSpace, score: Tensor
+    ) -> None:
+        self._set, self._part, self._own, self._free, self._score = settings, part, own, free, score
+        trust = score + 1e-6
+        self._weight = trust / trust.sum()
+        self._steps = () if part.is_fixed else tuple(settings.sizes)
+
+    def __call__(self, R: Tensor, t: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Poses R (d, 3, 3), t (d, 3), sizes (d, k) and score (d,); as they were where they make no part."""
+        size = self._said = self._start(sizes)
+        surface = self._surface(size)
+        if surface is None:
+            return R, t, sizes, self._score
+        turns = similar_turns(self._part, self._set.alike)
+        best = self._best_of(turns, surface, R, t)
+        for step in self._steps:
+            size, best = self._search(size, best, step)
+            if step >= WIDE:
+                again = self._best_of(turns, self._known(size), best.R, best.t)
+                best = min(best, again, key=lambda poses: self._total(size, poses))
+        size = self._between(size, best)
+        best = self._registered(self._known(size), best.R, best.t, self._set.steps)
+        score = self._score
+        if self._set.doubtful is not None:
+            score = score * torch.exp(-best.off / self._set.doubtful)
+        return best.R, best.t, torch.tensor(size, dtype=torch.float64).expand(len(R), -1), score
+
+    def _start(self, sizes: Tensor) -> Size:
+        """The median of what was said (d, k), on a lattice, so that scenes share their surfaces."""
+        known = sizes[~sizes.isnan().any(1)]
+        said = known.median(0).values.numpy() if len(known) else self._part.grids["L"].mean(0)
+        return _rounded(said, self._steps[-1]) if self._steps else tuple(said.tolist())
+
+    def _search(self, size: Size, best: _Poses, step: float) -> tuple[Size, _Poses]:
+        """One parameter after the other up or down by a step, as long as that explains the cloud better."""
+        for _ in range(ROUNDS):
+            before = size
+            for i, sign in product(range(self._part.k), (1, -1)):
+                tried = self._changed(size, i, sign * step)
+                poses = self._moved(tried, best)
+                if poses is not None and self._total(tried, poses) < self._total(size, best):
+                    size, best = tried, poses
+            if size == before:
+                break
+        return size, best
+
+    def _between(self, size: Size, best: _Poses) -> Size:
+        """The lowest point of a parabola through each parameter's neighbours on the lattice."""
+        if not self._steps:
+            return size
+        step, exact = self._steps[-1], list(size)
+        middle = self._total(size, best)
+        for i in range(len(size)):
+            sides = [self._changed(size, i, sign * step) for sign in (1, -1)]
+            poses = [self._moved(tried, best) for tried in sides]
+            up, down = (
+                middle if one is None else self._total(tried, one)
+                for tried, one in zip(sides, poses, strict=True)
+            )
+            bend = up + down - 2 * middle
+            if bend > 0:
+                exact[i] += float(np.clip(step * (down - up) / (2 * bend), -step / 2, step / 2))
+        return tuple(exact) if self._surface(tuple(exact)) is not None else size
+
+    def _changed(self, size: Size, parameter: int, by: float) -> Size:
+        changed = np.array(size)
+        changed[parameter] += by
+        return _rounded(changed, self._steps[-1])
+
+    def _total(self, size: Size, poses: _Poses) -> float:
+        """What all instances together make of a size, metres."""
+        change = float(np.abs(np.subtract(size, self._said)).mean())
+        return float((self._weight * poses.off.clamp(max=self._set.reach)).sum()) + self._set.hold * change
+
+    def _moved(self, size: Size, poses: _Poses) -> _Poses | None:
+        """The poses registered again under another size; None where that makes no part."""
+        surface = self._surface(size)
+        return None if surface is None else self._registered(surface, poses.R, poses.t, FEW)
+
+    def _best_of(self, turns: Tensor, surface: Surface, R: Tensor, t: Tensor) -> _Poses:
+        """Of each instance's poses, turned by every one of (q, 3, 3), that which explains the cloud best."""
+        d, q = len(R), len(turns)
+        turned = (R[:, None] @ turns).flatten(0, 1)
+        own = self._own.of(torch.arange(d).repeat_interleave(q))
+        all_poses = self._registered(surface, turned, t.repeat_interleave(q, 0), self._set.steps, own)
+        best = torch.arange(d) * q + all_poses.off.view(d, q).argmin(1)
+        return _Poses(all_poses.R[best], all_poses.t[best], all_poses.off[best])
+
+    def _registered(
+        self, surface: Surface, R: Tensor, t: Tensor, steps: int, own: OwnPoints | None = None
+    ) -> _Poses:
+        own, settings = self._own if own is None else own, self._set
+        R, t = register(surface, own, R, t, settings.slack, steps)
+        return _Poses(R, t, misfit(surface, own, R, t, self._free, settings.free, settings.reach))
+
+    def _surface(self, size: Size) -> Surface | None:
+        return sample_surface(self._part, size, self._set.samples)
+
+    def _known(self, size: Size) -> Surface:
+        surface = self._surface(size)
+        assert surface is not None
+        return surface
+
+
+@lru_cache(maxsize=64)
+def similar_turns(part: ParametricPart, alike: float) -> Tensor:
+    """Turns by quarters after which a part looks much as before, none of them twice for its symmetry.
+
+    Args:
+        alike: largest mean distance of the turned surface from itself, as a share of its radius about the
+            centroid, for a part object of middle size.
+    Returns:
+        (q, 3, 3) rotations of the part frame, float64; the first turns nothing.
+    """
+    kept = [torch.eye(3, dtype=torch.float64)]
+    surface = sample_surface(part, tuple(part.grids["L"].mean(0).tolist()), 500)
+    if surface is None or alike <= 0:
+        return torch.stack(kept)
+    points = torch.from_numpy(surface.points)
+    radius = float(torch.linalg.vector_norm(points, dim=-1).max())
+    for turn in _quarter_turns():
+        distance = float(torch.cdist(points @ turn.mT, points).amin(1).mean())
+        known = [rotation_angle(nearest_equivalent(turn, other, part.symmetry), other) for other in kept]
+        if distance <= alike * radius and min(map(float, known)) > SAME:
+            kept.append(turn)
+    return torch.stack(kept)
+
+
+def _quarter_turns() -> list[Tensor]:
+    """The 24 rotations that carry a cube onto itself."""
+    signed = [
+        torch.eye(3, dtype=torch.float64)[list(order)] * torch.tensor(signs, dtype=torch.float64)[:, None]
+        for order, signs in product(permutations(range(3)), product((1, -1), repeat=3))
+    ]
+    return [matrix for matrix in signed if float(torch.linalg.det(matrix)) > 0]
+
+
+def _rounded(size: np.ndarray, step: float) -> Size:
+    """To multiples of the step; twelve digits, so that equal sizes are equal numbers."""
+    return tuple(round(round(x / step) * step, 12) for x in size.tolist())

@@ -1,0 +1,155 @@
+"""Many poses of one part at once, registered onto points of its surface and judged by the whole cloud.
+
+A pose is wrong not only where its points lie off the surface: also where it puts surface in front of what
+the camera saw farther away. Points alone cannot tell that a face is too large.
+"""
+
+from dataclasses import dataclass
+
+import roma
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from pnet.postprocess.surface import Surface
+
+TURN = 0.3  # radians, the largest of a step
+STIFFNESS = (1e-7, 1e-2)  # share of a step's normal equations that holds turn (metres²) and shift back
+
+
+@dataclass(frozen=True, eq=False)
+class OwnPoints:
+    """Some points of every instance.
+
+    Attributes:
+        points: (d, n, 3) camera frame, metres. counted: (d, n) 1, or 0 where an instance has fewer.
+    """
+
+    points: Tensor
+    counted: Tensor
+
+    def of(self, index: Tensor) -> "OwnPoints":
+        """Those of some instances, of any of them several times."""
+        return OwnPoints(self.points[index], self.counted[index])
+
+
+class FreeSpace:
+    """How far the camera saw, in every direction.
+
+    Args:
+        cloud: (N, 3) camera frame, metres. slack: of the depth, metres.
+    """
+
+    def __init__(self, cloud: Tensor, slack: float) -> None:
+        direction = cloud[:, :2] / cloud[:, 2:]
+        self._slack = slack
+        self._low = direction.amin(0)
+        self._cell = _spacing(direction)
+        place = self._place(direction)
+        columns, rows = (place.amax(0) + 2).tolist()
+        self._size = torch.tensor([columns, rows])
+        nearest = torch.full((rows * columns,), torch.inf, dtype=cloud.dtype)
+        nearest.scatter_reduce_(0, place[:, 1] * columns + place[:, 0], cloud[:, 2], "amin")
+        # the nearest of all around: what lies beside an edge must not count as seen through
+        around = F.max_pool2d(-nearest.view(1, rows, columns), 3, 1, 1)
+        self._depth = -around.flatten()
+
+    def through(self, places: Tensor) -> Tensor:
+        """By how much the camera saw past places (..., 3), metres; 0 where it saw nothing."""
+        place = self._place(places[..., :2] / places[..., 2:])
+        inside = ((place >= 0) & (place < self._size)).all(-1)
+        column, row = torch.where(inside[..., None], place, 0).unbind(-1)
+        depth = self._depth[row * self._size[0] + column]
+        seen = inside & depth.isfinite()
+        return torch.where(seen, depth - places[..., 2] - self._slack, 0.0).clamp(min=0)
+
+    def _place(self, direction: Tensor) -> Tensor:
+        """Column and row of directions (..., 2); a border of one cell is left free."""
+        return ((direction - self._low) / self._cell).floor().long() + 1
+
+
+def register(
+    surface: Surface, own: OwnPoints, R: Tensor, t: Tensor, slack: float, steps: int
+) -> tuple[Tensor, Tensor]:
+    """Gauss–Newton steps towards the least distances of own points from the surface that a pose shows.
+
+    The distance from the tangent plane of the nearest sample counts, and beyond `slack` that along the plane:
+    it holds points that lie past an edge.
+
+    Args:
+        surface: n samples. own: of q poses. R: (q, 3, 3), t: (q, 3) part → camera, metres.
+        slack: distance along the surface that samples and points leave open, metres; a point so far off the
+            surface counts half.
+    Returns:
+        R (q, 3, 3), t (q, 3).
+    """
+    hold = R.new_tensor([STIFFNESS[0]] * 3 + [STIFFNESS[1]] * 3)
+    for _ in range(steps):
+        local, off, normal, _ = _nearest(surface, own, R, t)
+        weight = own.counted / (1 + off.square().sum(-1) / slack**2)
+        height = (off * normal).sum(-1)
+        along = off - height[..., None] * normal
+        length = torch.linalg.vector_norm(along, dim=-1)
+        past = (length - slack).clamp(min=0)
+        towards = along / length.clamp(min=1e-9)[..., None]
+        A, b = _normal_equations(local, normal, height, weight)
+        A_past, b_past = _normal_equations(local, towards, past, 0.5 * weight * (past > 0))
+        total = weight.sum(-1)[:, None] + 1
+        step = torch.linalg.solve(A + A_past + torch.diag_embed(total * hold), -(b + b_past))
+        angle = torch.linalg.vector_norm(step[:, :3], dim=-1, keepdim=True)
+        step = step * (TURN / angle.clamp(min=TURN))
+        # x in the part frame goes to dR x + dt, so the pose to (R dRᵀ, t − R dRᵀ dt)
+        R = R @ roma.rotvec_to_rotmat(step[:, :3]).mT
+        t = t - (R @ step[:, 3:, None])[..., 0]
+    return roma.special_procrustes(R), t
+
+
+def misfit(
+    surface: Surface, own: OwnPoints, R: Tensor, t: Tensor, free: FreeSpace, share: float, most: float
+) -> Tensor:
+    """How badly poses explain what was seen.
+
+    Args:
+        surface, own, R, t: as for `register`. share: weight of surface in free space.
+        most: what lies farther off counts as so far, metres.
+    Returns:
+        (q,) metres: mean distance of own points from the surface that the pose shows, plus `share` times the
+        mean depth by which the camera saw through that surface.
+    """
+    _, off, _, facing = _nearest(surface, own, R, t)
+    distance = torch.linalg.vector_norm(off, dim=-1).clamp(max=most)
+    points = (distance * own.counted).sum(-1) / own.counted.sum(-1)
+    places = torch.from_numpy(surface.points) @ R.mT + t[:, None]
+    through = free.through(places).clamp(max=most)
+    return points + share * (through * facing).sum(-1) / facing.sum(-1).clamp(min=1)
+
+
+def _nearest(surface: Surface, own: OwnPoints, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Own points (q, n, 3) in the part frame, their offsets from the nearest sample that the pose shows,
+    the normals there, and which samples it shows (q, s)."""
+    samples, normals = torch.from_numpy(surface.points), torch.from_numpy(surface.normals)
+    local = (own.points - t[:, None]) @ R
+    camera = -(t[:, None] @ R)
+    facing = ((camera - samples) * normals).sum(-1) > 0
+    # ‖x − s‖² less ‖x‖², in single precision: which sample is nearest need not be exact
+    square = samples.square().sum(-1).float() - 2 * local.float() @ samples.float().mT
+    nearest = square.masked_fill(~facing[:, None], torch.inf).argmin(-1)
+    return local, local - samples[nearest], normals[nearest], facing
+
+
+def _normal_equations(
+    local: Tensor, direction: Tensor, length: Tensor, weight: Tensor
+) -> tuple[Tensor, Tensor]:
+    """JᵀWJ (q, 6, 6) and JᵀWr (q, 6) of lengths r (q, n) along directions (q, n, 3) at places (q, n, 3)."""
+    J = torch.cat([torch.linalg.cross(local, direction), direction], -1)
+    weighted = (J * weight[..., None]).mT
+    return weighted @ J, (weighted @ length[..., None])[..., 0]
+
+
+def _spacing(direction: Tensor) -> float:
+    """A little more than the distance of neighbouring directions (N, 2)."""
+    some = direction[:: max(len(direction) // 256, 1)]
+    between = torch.cdist(some, direction)
+    own = between.masked_fill(between <= 0, torch.inf).amin(1)
+    own = own[own.isfinite()]
+    return max(1.25 * float(own.median()), 1e-6) if len(own) else 1.0
