@@ -30,6 +30,20 @@ ICP = {
     "iterations": 30,
     "min_points": 20,
 }
+SURFACE = {
+    "_target_": "pnet.postprocess.surface_fit.SurfaceFit",
+    "samples": 600,
+    "points": 64,
+    "steps": 8,
+    "reach": 0.004,
+    "slack": 0.002,
+    "free": 1.0,
+    "alike": 0.15,
+    "sizes": [0.0024, 0.0012, 0.0006, 0.0003],
+    "shared": True,
+    "hold": 0.01,
+    "doubtful": 0.001,
+}
 
 
 pytestmark = pytest.mark.usefixtures("hydra_app")
@@ -156,6 +170,38 @@ def test_icp_alone_trains_pprnet_under_its_plain_name():
     assert OmegaConf.to_container(recovery_settings(evaluation.postprocess, again))["refine"] == ICP
 
 
+def test_the_tables_of_the_surface_evaluate_the_runs_of_table_3_once_more():
+    plain, fitted = {}, {"refine": SURFACE}
+    jobs = by_name(planned("surface", "protocol=small", "part=tn42"))
+    assert sorted(jobs) == ["tn42_small", "tn42_small_method-pprnet"]
+    for method, name in (("PPR-Net", "tn42_small_method-pprnet"), ("ParametricNet", "tn42_small")):
+        job = jobs[name]
+        assert job.cells == [
+            f"Table {number}: {method}{how} / TN42"
+            for number in ("S1", "S2")
+            for how in ("", " fitted to the surface")
+        ]
+        assert [(each.split, each.postprocess) for each in job.evaluations.values()] == [
+            ("test_l", plain),
+            ("test_l", fitted),
+            ("test_g", plain),
+            ("test_g", fitted),
+        ]
+        assert job.postprocess["refine"] is None and not any("refine" in word for word in job.overrides)
+    both = by_name(planned("surface,table3", "protocol=small", "part=tn42"))
+    assert {name: len(job.cells) for name, job in both.items()} == dict.fromkeys(jobs, 5)
+    assert {name: len(job.evaluations) for name, job in both.items()} == dict.fromkeys(jobs, 4)
+
+
+def test_the_surface_alone_trains_under_the_plain_name():
+    (job,) = planned("surface_g", "protocol=smoke", "part=tn34", "method=pprnet", "refine=surface")
+    assert job.run.name == "tn34_smoke_method-pprnet"
+    again = resolved(*job.command())
+    (evaluation,) = wanted_evaluations(OmegaConf.to_container(again.evaluate))
+    assert again.postprocess.refine is None and evaluation.split == "test_g"
+    assert OmegaConf.to_container(recovery_settings(evaluation.postprocess, again))["refine"] == SURFACE
+
+
 # how many
 
 
@@ -188,6 +234,16 @@ def test_the_siléane_parts_lie_in_the_wider_bin(everything):
     wide = {name.split("_")[0] for name, job in by_name(everything).items() if job.generate}
     assert wide == {"candlestick", "gear", "tless20", "tless29"}
     assert {job.generate for job in everything} == {(), ("bin=box_400", "view=far", "camera.far=2")}
+
+
+def test_the_tables_of_the_surface_are_two_trainings_a_part():
+    jobs = planned("surface", "protocol=smoke")
+    assert Counter(job.run.name.split("_")[0] for job in jobs) == dict.fromkeys(
+        ("tn06", "tn16", "tn34", "tn42"), 2
+    )
+    assert sum(len(job.evaluations) for job in jobs) == sum(len(job.cells) for job in jobs) == 2 * 4 * 4
+    trained = [job.settings for job in planned("table3", "protocol=smoke")]
+    assert len(trained) == 8 and all(job.settings in trained for job in jobs)
 
 
 def test_a_part_restricts_a_sweep_to_its_cells():
@@ -442,10 +498,10 @@ def test_metrics_that_are_no_text_are_missing(tmp_path):
 # the command
 
 
-@pytest.mark.parametrize("sweep", ["table2", "table5"])
+@pytest.mark.parametrize("sweep", ["table2", "table5", "surface"])
 @pytest.mark.parametrize("words", [("protocol=smoke",), ("protocol=small", "experiment=paper", "seed=3")])
 def test_a_jobs_command_composes_to_its_settings(sweep, words):
-    for job in planned(sweep, *words, "part=tn34" if sweep == "table5" else "part=gear"):
+    for job in planned(sweep, *words, "part=gear" if sweep == "table2" else "part=tn34"):
         again = resolved(*job.command())
         assert training_settings(again) == job.settings
         assert OmegaConf.to_container(again.postprocess) == job.postprocess

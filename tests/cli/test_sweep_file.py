@@ -58,7 +58,7 @@ def published(table):
 
 def test_every_file_reads():
     names = sorted(path.stem for path in sweeps_dir().glob("*.yaml"))
-    assert names == ["all", "table2", "table3", "table4", "table5"]
+    assert names == ["all", "surface", "surface_g", "surface_l", "table2", "table3", "table4", "table5"]
     for name in names:
         for table in read_sweep(name):
             assert table.title and table.caption and list(table.cells())
@@ -82,7 +82,7 @@ def test_published_figures_are_the_papers(name, figures):
     assert list(published(one(name))) == list(figures)
 
 
-@pytest.mark.parametrize("name", ["table3", "table5"])
+@pytest.mark.parametrize("name", ["table3", "table5", "surface_l", "surface_g"])
 def test_the_templates_are_the_columns(name):
     table = one(name)
     assert [column.name for column in table.columns] == TEMPLATES
@@ -143,6 +143,23 @@ def test_the_rows_that_are_trained_are_the_papers_and_the_two_rules():
     }
     own = {row.name for table in read_sweep("all") for row in table.rows if row.origin == "ours"}
     assert own == {"Keypoints nearest to the camera", "Keypoints nearest to the point"}
+
+
+def test_the_tables_of_the_surface_are_two_methods_with_and_without_it():
+    tables = read_sweep("surface")
+    assert [(table.number, table.metric, table.split) for table in tables] == [
+        ("S1", "mAP", "test_l"),
+        ("S2", "mAP", "test_g"),
+    ]
+    assert tables == [one("surface_l"), one("surface_g")] and not set(tables) & set(read_sweep("all"))
+    for table in tables:
+        assert [(row.name, row.set, row.origin, row.published) for row in table.rows] == [
+            ("PPR-Net", ("method=pprnet", "refine=none"), "both", ()),
+            ("PPR-Net fitted to the surface", ("method=pprnet", "refine=surface"), "ours", ()),
+            ("ParametricNet", ("method=parametricnet", "refine=none"), "both", ()),
+            ("ParametricNet fitted to the surface", ("method=parametricnet", "refine=surface"), "ours", ()),
+        ]
+    assert [len(list(table.cells())) for table in tables] == [4 * 4, 4 * 4]
 
 
 def test_cells_are_those_that_are_trained_row_by_row():
@@ -253,7 +270,8 @@ def test_a_list_of_sweeps_that_leads_to_itself_is_refused(write, tmp_path):
 def test_no_such_sweep_names_the_closest():
     with pytest.raises(ValueError, match="sweep=tabel5: no such sweep, did you mean table5"):
         read_sweep("tabel5")
-    with pytest.raises(ValueError, match="there are all, table2, table3, table4, table5, or give a path"):
+    known = "there are all, surface, surface_g, surface_l, table2, table3, table4, table5, or give a path"
+    with pytest.raises(ValueError, match=known):
         read_sweep("nothing_like_it")
 
 

@@ -10,9 +10,12 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf, open_dict
 from torch.utils.tensorboard import SummaryWriter
 
+from pnet.cli.evaluate import Evaluation
+from pnet.cli.jobs import composed
 from pnet.cli.runs import RunIndex
 from pnet.cli.sweep_file import Heading, TablePlan, read_sweep
 from pnet.cli.table import collect, sweep_name
+from pnet.cli.table_runs import Collected
 
 RUNS = Path("outputs/train")
 SMOKE = ("protocol=smoke",)
@@ -140,6 +143,30 @@ def test_a_run_with_other_post_processing_is_read_by_the_difference():
     write_run("mine", "postprocess.trust=null", evaluations={FULL: 0.125, "test_g_trust-0.001": 0.5})
     assert values(collected())["full"] == (0.5,)
     assert values(collected("postprocess.trust=null"))["full"] == (0.125,)
+
+
+def test_the_tables_of_the_surface_find_a_runs_two_evaluations():
+    fitted = composed(("part=tn34", *SMOKE, "method=pprnet", "refine=surface")).postprocess["refine"]
+    names = [Evaluation(split, {"refine": fitted}).name for split in ("test_l", "test_g")]
+    scores = {"test_l": 0.25, "test_g": 0.125, names[0]: 0.75, names[1]: 0.5}
+    run = write_run("one", "method=pprnet", evaluations=scores)
+    for name, figures in (("surface_l", (0.25, 0.75)), ("surface_g", (0.125, 0.5))):
+        (plan,) = read_sweep(name)
+        found = Collected(plan)
+        table = collect(plan, [*SMOKE, "part=tn34"], RunIndex(RUNS), "smoke", found)
+        assert [row.cells[2].values for row in table.rows] == [(figures[0],), (figures[1],), (), ()]
+        assert [(each.run, each.cell.row, each.cell.column) for each in found.served] == [
+            (run, 0, 2),
+            (run, 1, 2),
+        ]
+        assert table.missing == tuple(
+            f"Table {plan.number}: {row} / TN34: no run"
+            for row in ("ParametricNet", "ParametricNet fitted to the surface")
+        )
+        assert [row.title for row in table.rows][:2] == [
+            "PPR-Net",
+            "PPR-Net fitted to the surface (ours, not in the paper)",
+        ]
 
 
 def test_naming_a_part_leaves_the_other_columns_out():

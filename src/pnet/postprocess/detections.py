@@ -8,6 +8,8 @@ from torch import Tensor
 from pnet.parts.base import ParametricPart
 from pnet.records import Detections
 
+LEFT_OUT = -1.0  # in place of the score of an instance that is seen too little of
+
 
 def on_cpu(found: Detections) -> Detections:
     """All of it on the CPU: the instances' small fields in one transfer, the points' numbers in another."""

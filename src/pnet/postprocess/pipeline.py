@@ -9,7 +9,7 @@ from torch import Tensor
 from pnet.parts.base import ParametricPart
 from pnet.postprocess.batches import in_batches, sound_points
 from pnet.postprocess.cluster import CentroidClusters
-from pnet.postprocess.detections import by_scene, no_detections, on_cpu
+from pnet.postprocess.detections import LEFT_OUT, by_scene, no_detections, on_cpu
 from pnet.postprocess.fit import fit_template
 from pnet.postprocess.folded_vote import FoldedVote
 from pnet.postprocess.grouping import Clusters, clusters_of
@@ -18,8 +18,6 @@ from pnet.postprocess.refinement import Refinement
 from pnet.postprocess.score import instance_score, sure_enough
 from pnet.postprocess.vote import InstanceVotes, PointVotes, Voting
 from pnet.records import Detections, PointPrediction
-
-LEFT_OUT = -1.0  # in place of the score of an instance that is seen too little of
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """PPR-Net's post-processing: the poses that a cluster's points predict are averaged."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -13,7 +13,7 @@ from pnet.geometry.rotation_mean import mean_rotation
 from pnet.parts.base import ParametricPart
 from pnet.postprocess.batches import in_batches, sound_points
 from pnet.postprocess.cluster import CentroidClusters
-from pnet.postprocess.detections import by_scene, no_detections, on_cpu
+from pnet.postprocess.detections import LEFT_OUT, by_scene, no_detections, on_cpu
 from pnet.postprocess.grouping import clusters_of
 from pnet.postprocess.refinement import Refinement
 from pnet.postprocess.score import instance_score, sure_enough
@@ -70,14 +70,16 @@ class PoseAveraging:
         parameters = known_parameters(part, len(groups))
         unknown = t.new_full((len(groups), len(part.chain), 3), math.nan)
         score = instance_score(prediction.visibility, clusters)
-        sure = sure_enough(score, prediction.visibility, self.visibility_threshold).cpu()
-        found = on_cpu(Detections(R, t, parameters.to(t), score, unknown, clusters.owner))
+        sure = sure_enough(score, prediction.visibility, self.visibility_threshold)
+        marked = torch.where(sure, score, LEFT_OUT)
+        found = on_cpu(Detections(R, t, parameters.to(t), marked, unknown, clusters.owner))
         if self.refine is not None and points is not None:
             found = self.refine.refined(part, found, points, clusters.scenes)
-        if not bool(found.parameters.isnan().any()):  # parts need not bear NaN
-            places = part.chain.keypoints_from_parameters(found.parameters)
-            found = replace(found, keypoints=apply_pose(found.R, found.t, places))
-        return by_scene(found, sure, clusters.scenes)
+        known = ~found.parameters.isnan().any(1)
+        if bool(known.any()):  # parts need not bear NaN
+            places = part.chain.keypoints_from_parameters(found.parameters[known])
+            found.keypoints[known] = apply_pose(found.R[known], found.t[known], places)
+        return by_scene(found, found.score > LEFT_OUT, clusters.scenes)
 
     def _seen(self, prediction: PosePrediction) -> Tensor:
         """(B, N) bool, which points count: those that are visible enough."""

@@ -183,7 +183,8 @@ class _Fit:
     def _total(self, size: Size, poses: _Poses) -> float:
         """What all instances together make of a size, metres."""
         change = float(np.abs(np.subtract(size, self._said)).mean())
-        return float((self._weight * poses.off.clamp(max=self._set.reach)).sum()) + self._set.hold * change
+        # one that is farther off than the slack is somewhere else: it says nothing of the size
+        return float((self._weight * poses.off.clamp(max=self._set.slack)).sum()) + self._set.hold * change
 
     def _moved(self, size: Size, poses: _Poses) -> _Poses | None:
         """The poses registered again under another size; None where that makes no part."""
@@ -204,7 +205,11 @@ class _Fit:
     ) -> _Poses:
         own, settings = self._own if own is None else own, self._set
         R, t = register(surface, own, R, t, settings.slack, steps)
-        return _Poses(R, t, misfit(surface, own, R, t, self._free, settings.free, settings.reach))
+        return _Poses(R, t, self._misfit(surface, own, R, t))
+
+    def _misfit(self, surface: Surface, own: OwnPoints, R: Tensor, t: Tensor) -> Tensor:
+        settings = self._set
+        return misfit(surface, own, R, t, settings.slack, self._free, settings.free, settings.reach)
 
     def _surface(self, size: Size) -> Surface | None:
         return sample_surface(self._part, size, self._set.samples)

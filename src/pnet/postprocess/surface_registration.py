@@ -14,6 +14,7 @@ from torch.nn import functional as F
 from pnet.postprocess.surface import Surface
 
 TURN = 0.3  # radians, the largest of a step
+MOST_CELLS = 2000  # a side of the table of depths
 STIFFNESS = (1e-7, 1e-2)  # share of a step's normal equations that holds turn (metres²) and shift back
 
 
@@ -41,12 +42,17 @@ class FreeSpace:
     """
 
     def __init__(self, cloud: Tensor, slack: float) -> None:
+        cloud = cloud[cloud.isfinite().all(1) & (cloud[:, 2] > 0)]
         direction = cloud[:, :2] / cloud[:, 2:]
         self._slack = slack
-        self._low = direction.amin(0)
-        self._cell = _spacing(direction)
+        self._low, extent = torch.zeros(2, dtype=cloud.dtype), torch.zeros(2, dtype=cloud.dtype)
+        if len(cloud):
+            self._low = direction.amin(0)
+            extent = direction.amax(0) - self._low
+        # a stray point far outside makes the cells coarse, not the table large
+        self._cell = max(_spacing(direction), float(extent.max()) / MOST_CELLS)
         place = self._place(direction)
-        columns, rows = (place.amax(0) + 2).tolist()
+        columns, rows = ((extent / self._cell).floor().long() + 3).tolist()
         self._size = torch.tensor([columns, rows])
         nearest = torch.full((rows * columns,), torch.inf, dtype=cloud.dtype)
         nearest.scatter_reduce_(0, place[:, 1] * columns + place[:, 0], cloud[:, 2], "amin")
@@ -78,20 +84,16 @@ def register(
 
     Args:
         surface: n samples. own: of q poses. R: (q, 3, 3), t: (q, 3) part → camera, metres.
-        slack: distance along the surface that samples and points leave open, metres; a point so far off the
-            surface counts half.
+        slack: distance along the surface that samples and points leave open, metres; a point twice as far
+            off counts half.
     Returns:
         R (q, 3, 3), t (q, 3).
     """
     hold = R.new_tensor([STIFFNESS[0]] * 3 + [STIFFNESS[1]] * 3)
     for _ in range(steps):
         local, off, normal, _ = _nearest(surface, own, R, t)
-        weight = own.counted / (1 + off.square().sum(-1) / slack**2)
-        height = (off * normal).sum(-1)
-        along = off - height[..., None] * normal
-        length = torch.linalg.vector_norm(along, dim=-1)
-        past = (length - slack).clamp(min=0)
-        towards = along / length.clamp(min=1e-9)[..., None]
+        weight = own.counted / (1 + off.square().sum(-1) / (2 * slack) ** 2)
+        height, past, towards = _split(off, normal, slack)
         A, b = _normal_equations(local, normal, height, weight)
         A_past, b_past = _normal_equations(local, towards, past, 0.5 * weight * (past > 0))
         total = weight.sum(-1)[:, None] + 1
@@ -105,19 +107,27 @@ def register(
 
 
 def misfit(
-    surface: Surface, own: OwnPoints, R: Tensor, t: Tensor, free: FreeSpace, share: float, most: float
+    surface: Surface,
+    own: OwnPoints,
+    R: Tensor,
+    t: Tensor,
+    slack: float,
+    free: FreeSpace,
+    share: float,
+    most: float,
 ) -> Tensor:
     """How badly poses explain what was seen.
 
     Args:
-        surface, own, R, t: as for `register`. share: weight of surface in free space.
+        surface, own, R, t, slack: as for `register`. share: weight of surface in free space.
         most: what lies farther off counts as so far, metres.
     Returns:
         (q,) metres: mean distance of own points from the surface that the pose shows, plus `share` times the
         mean depth by which the camera saw through that surface.
     """
-    _, off, _, facing = _nearest(surface, own, R, t)
-    distance = torch.linalg.vector_norm(off, dim=-1).clamp(max=most)
+    _, off, normal, facing = _nearest(surface, own, R, t)
+    height, past, _ = _split(off, normal, slack)
+    distance = torch.hypot(height, past).clamp(max=most)
     points = (distance * own.counted).sum(-1) / own.counted.sum(-1)
     places = torch.from_numpy(surface.points) @ R.mT + t[:, None]
     through = free.through(places).clamp(max=most)
@@ -137,6 +147,15 @@ def _nearest(surface: Surface, own: OwnPoints, R: Tensor, t: Tensor) -> tuple[Te
     return local, local - samples[nearest], normals[nearest], facing
 
 
+def _split(off: Tensor, normal: Tensor, slack: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Offsets (..., 3) from a sample: height over its plane, length along it beyond the slack, and the unit
+    vectors of the latter."""
+    height = (off * normal).sum(-1)
+    along = off - height[..., None] * normal
+    length = torch.linalg.vector_norm(along, dim=-1)
+    return height, (length - slack).clamp(min=0), along / length.clamp(min=1e-9)[..., None]
+
+
 def _normal_equations(
     local: Tensor, direction: Tensor, length: Tensor, weight: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -148,6 +167,8 @@ def _normal_equations(
 
 def _spacing(direction: Tensor) -> float:
     """A little more than the distance of neighbouring directions (N, 2)."""
+    if not len(direction):
+        return 1.0
     some = direction[:: max(len(direction) // 256, 1)]
     between = torch.cdist(some, direction)
     own = between.masked_fill(between <= 0, torch.inf).amin(1)
