@@ -5,6 +5,7 @@ instance's points, in the pose that was voted and in those that look much like i
 scene are one part object, the size under which all of them together explain the cloud best is theirs.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -26,6 +27,7 @@ ROUNDS = 3  # each parameter is tried up and down at most so often with one step
 FEW = 2  # steps of a registration for another size
 WIDE = 0.001  # metres: after sizes have changed in steps of this, other poses are tried again
 SAME = 0.1  # radians between rotations that count as one
+OTHER = 0.35  # radians between poses that cannot both be right
 Size = tuple[float, ...]
 
 
@@ -48,6 +50,8 @@ class SurfaceFit:
         shared: whether the instances of a scene are one part object; false: each has its own size.
         hold: misfit that a change of the sizes must save, a metre of change.
         doubtful: misfit by which the score falls by a factor of e, metres; None: it stays.
+        ambiguous: where another of the turned poses explains an instance nearly as well the score falls too:
+            a pose counts less by a factor of e for so much misfit more, metres; None: it does not fall.
     """
 
     samples: int
@@ -61,9 +65,10 @@ class SurfaceFit:
     shared: bool
     hold: float
     doubtful: float | None
+    ambiguous: float | None
 
     def __post_init__(self) -> None:
-        for name in ("samples", "points", "steps", "reach", "slack", "doubtful"):
+        for name in ("samples", "points", "steps", "reach", "slack", "doubtful", "ambiguous"):
             value = getattr(self, name)
             if value is not None and value <= 0:
                 raise ValueError(f"postprocess.refine.{name} is {value}, expected a positive number")
@@ -132,10 +137,13 @@ class _Fit:
                 again = self._best_of(turns, self._known(size), best.R, best.t)
                 best = min(best, again, key=lambda poses: self._total(size, poses))
         size = self._between(size, best)
-        best = self._registered(self._known(size), best.R, best.t, self._set.steps)
+        every = self._turned(turns, self._known(size), best.R, best.t)
+        best = self._least(every)
         score = self._score
         if self._set.doubtful is not None:
             score = score * torch.exp(-best.off / self._set.doubtful)
+        if self._set.ambiguous is not None:
+            score = score * self._share(every, best, self._set.ambiguous)
         return best.R, best.t, torch.tensor(size, dtype=torch.float64).expand(len(R), -1), score
 
     def _start(self, sizes: Tensor) -> Size:
@@ -167,11 +175,11 @@ class _Fit:
             sides = [self._changed(size, i, sign * step) for sign in (1, -1)]
             poses = [self._moved(tried, best) for tried in sides]
             up, down = (
-                middle if one is None else self._total(tried, one)
+                math.inf if one is None else self._total(tried, one)
                 for tried, one in zip(sides, poses, strict=True)
             )
             bend = up + down - 2 * middle
-            if bend > 0:
+            if 0 < bend < math.inf:  # beside a size that makes no part there is no parabola
                 exact[i] += float(np.clip(step * (down - up) / (2 * bend), -step / 2, step / 2))
         return tuple(exact) if self._surface(tuple(exact)) is not None else size
 
@@ -192,13 +200,31 @@ class _Fit:
         return None if surface is None else self._registered(surface, poses.R, poses.t, FEW)
 
     def _best_of(self, turns: Tensor, surface: Surface, R: Tensor, t: Tensor) -> _Poses:
-        """Of each instance's poses, turned by every one of (q, 3, 3), that which explains the cloud best."""
+        return self._least(self._turned(turns, surface, R, t))
+
+    def _turned(self, turns: Tensor, surface: Surface, R: Tensor, t: Tensor) -> _Poses:
+        """(d · q) poses: each instance's, turned by every one of (q, 3, 3) and registered."""
         d, q = len(R), len(turns)
         turned = (R[:, None] @ turns).flatten(0, 1)
         own = self._own.of(torch.arange(d).repeat_interleave(q))
-        all_poses = self._registered(surface, turned, t.repeat_interleave(q, 0), self._set.steps, own)
-        best = torch.arange(d) * q + all_poses.off.view(d, q).argmin(1)
-        return _Poses(all_poses.R[best], all_poses.t[best], all_poses.off[best])
+        return self._registered(surface, turned, t.repeat_interleave(q, 0), self._set.steps, own)
+
+    def _least(self, every: _Poses) -> _Poses:
+        """Of each instance's poses that which explains the cloud best."""
+        d = len(self._score)
+        best = every.off.view(d, -1).argmin(1) + torch.arange(0, len(every.off), len(every.off) // d)
+        return _Poses(every.R[best], every.t[best], every.off[best])
+
+    def _share(self, every: _Poses, best: _Poses, scale: float) -> Tensor:
+        """(d,) the best pose's part of a whole that it shares with those that differ from it.
+
+        A pose counts less by a factor of e for every `scale` of misfit more.
+        """
+        d = len(self._score)
+        R = best.R.repeat_interleave(len(every.off) // d, 0)
+        others = rotation_angle(nearest_equivalent(every.R, R, self._part.symmetry), R) > OTHER
+        more = every.off.view(d, -1) - best.off[:, None]
+        return 1 / (1 + (torch.exp(-more / scale) * others.view(d, -1)).sum(1))
 
     def _registered(
         self, surface: Surface, R: Tensor, t: Tensor, steps: int, own: OwnPoints | None = None
