@@ -13,7 +13,7 @@ from pnet.geometry.camera import Camera
 from pnet.geometry.rigid import apply_inverse_pose, rotation_angle
 from pnet.geometry.symmetry import nearest_equivalent
 from pnet.postprocess.icp import MAX_TURN, IcpRefinement, _Target, residual
-from pnet.postprocess.surface import Surface, sample_surface
+from pnet.postprocess.surface import sample_surface
 from pnet.scenes.rendering import render_view
 
 REFINE = IcpRefinement(model_points=2000, max_distance=0.005, iterations=30, min_points=20)
@@ -289,28 +289,6 @@ def test_the_result_is_double_and_the_arguments_stay(refine, one):
     assert found_R.dtype == found_t.dtype == torch.float64
     assert all(torch.equal(a, b) for a, b in zip(given, kept, strict=True))
     assert float(errors(part, size, R, t, found_R, found_t)) < 2e-5
-
-
-def test_only_faces_that_look_at_the_camera_are_matched():
-    """A cube 1 m before the camera: its front; with the sides, which are edge-on, and not its back."""
-    normals = np.concatenate([np.eye(3), -np.eye(3)])
-    surface = Surface(0.01 * normals, normals)
-    seen = surface.facing(np.eye(3), np.array([0, 0, 1.0]))
-    assert seen.normals.tolist() == [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, -1]]
-    tilted = Rotation.from_euler("y", 15, degrees=True).as_matrix()
-    assert len(surface.facing(tilted, np.array([0, 0, 1.0])).points) == 4
-
-
-def test_samples_lie_on_the_surface_with_its_normals(part, random_sizes):
-    size = random_sizes(part, 1)[0]
-    surface = sample_surface(part, tuple(size.tolist()), 500)
-    assert surface.points.shape == surface.normals.shape == (500, 3)
-    np.testing.assert_allclose(np.linalg.norm(surface.normals, axis=1), 1, atol=1e-12)
-    eye, zero = torch.eye(3).double(), torch.zeros(3).double()
-    on = torch.from_numpy(surface.points[:40])
-    assert surface_distance(part, size, eye, zero, on).max() < 1e-12
-    within = part.mesh(size.numpy()).contains(surface.points - 1e-5 * surface.normals)
-    assert within.mean() > 0.99  # all but those nearer than that to an edge
 
 
 def test_an_absent_library_is_named(one, monkeypatch):

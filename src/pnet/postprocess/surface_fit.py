@@ -19,6 +19,7 @@ from pnet.geometry.rigid import rotation_angle
 from pnet.geometry.symmetry import nearest_equivalent
 from pnet.parts.base import ParametricPart
 from pnet.postprocess.grouping import clusters_of
+from pnet.postprocess.pose_average import known_parameters
 from pnet.postprocess.surface import Surface, sample_surface
 from pnet.postprocess.surface_registration import FreeSpace, OwnPoints, misfit, register
 from pnet.records import Detections
@@ -93,7 +94,9 @@ class SurfaceFit:
             if not len(these):
                 continue
             free = FreeSpace(seen, self.slack)
-            for some in (these,) if self.shared else these.split(1):
+            said = sizes[these][~sizes[these].isnan().any(1)]
+            together = self.shared and (bool(self.sizes) or bool((said == said[:1]).all()))
+            for some in (these,) if together else these.split(1):
                 fit = _Fit(self, part, own.of(some), free, score[some])
                 R[some], t[some], sizes[some], score[some] = fit(R[some], t[some], sizes[some])
         return replace(found, R=R, t=t, parameters=sizes, score=score)
@@ -121,7 +124,9 @@ class _Fit:
         self._set, self._part, self._own, self._free, self._score = settings, part, own, free, score
         trust = score + 1e-6
         self._weight = trust / trust.sum()
-        self._steps = () if part.is_fixed else tuple(settings.sizes)
+        one = part.is_fixed or not bool(known_parameters(part, 1).isnan().any())
+        self._steps = () if one else tuple(settings.sizes)
+        self._far = settings.slack
 
     def __call__(self, R: Tensor, t: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Poses R (d, 3, 3), t (d, 3), sizes (d, k) and score (d,); as they were where they make no part."""
@@ -131,6 +136,7 @@ class _Fit:
             return R, t, sizes, self._score
         turns = similar_turns(self._part, self._set.alike)
         best = self._best_of(turns, surface, R, t)
+        self._far = max(self._far, float(best.off.median()))
         for step in self._steps:
             size, best = self._search(size, best, step)
             if step >= WIDE:
@@ -150,7 +156,9 @@ class _Fit:
         """The median of what was said (d, k), on a lattice, so that scenes share their surfaces."""
         known = sizes[~sizes.isnan().any(1)]
         said = known.median(0).values.numpy() if len(known) else self._part.grids["L"].mean(0)
-        return _rounded(said, self._steps[-1]) if self._steps else tuple(said.tolist())
+        exact: Size = tuple(said.tolist())
+        near = _rounded(said, self._steps[-1]) if self._steps else exact
+        return exact if self._surface(near) is None else near
 
     def _search(self, size: Size, best: _Poses, step: float) -> tuple[Size, _Poses]:
         """One parameter after the other up or down by a step, as long as that explains the cloud better."""
@@ -191,8 +199,8 @@ class _Fit:
     def _total(self, size: Size, poses: _Poses) -> float:
         """What all instances together make of a size, metres."""
         change = float(np.abs(np.subtract(size, self._said)).mean())
-        # one that is farther off than the slack is somewhere else: it says nothing of the size
-        return float((self._weight * poses.off.clamp(max=self._set.slack)).sum()) + self._set.hold * change
+        # one that is farther off than most were is somewhere else: it says nothing of the size
+        return float((self._weight * poses.off.clamp(max=self._far)).sum()) + self._set.hold * change
 
     def _moved(self, size: Size, poses: _Poses) -> _Poses | None:
         """The poses registered again under another size; None where that makes no part."""

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from pnet.postprocess.kernels import Kernels, step
 from pnet.postprocess.surface import Surface
 
 TURN = 0.3  # radians, the largest of a step
@@ -97,12 +98,12 @@ def register(
         A, b = _normal_equations(local, normal, height, weight)
         A_past, b_past = _normal_equations(local, towards, past, 0.5 * weight * (past > 0))
         total = weight.sum(-1)[:, None] + 1
-        step = torch.linalg.solve(A + A_past + torch.diag_embed(total * hold), -(b + b_past))
-        angle = torch.linalg.vector_norm(step[:, :3], dim=-1, keepdim=True)
-        step = step * (TURN / angle.clamp(min=TURN))
+        move = torch.linalg.solve(A + A_past + torch.diag_embed(total * hold), -(b + b_past))
+        angle = torch.linalg.vector_norm(move[:, :3], dim=-1, keepdim=True)
+        move = move * (TURN / angle.clamp(min=TURN))
         # x in the part frame goes to dR x + dt, so the pose to (R dRᵀ, t − R dRᵀ dt)
-        R = R @ roma.rotvec_to_rotmat(step[:, :3]).mT
-        t = t - (R @ step[:, 3:, None])[..., 0]
+        R = R @ roma.rotvec_to_rotmat(move[:, :3]).mT
+        t = t - (R @ move[:, 3:, None])[..., 0]
     return roma.special_procrustes(R), t
 
 
@@ -141,10 +142,22 @@ def _nearest(surface: Surface, own: OwnPoints, R: Tensor, t: Tensor) -> tuple[Te
     local = (own.points - t[:, None]) @ R
     camera = -(t[:, None] @ R)
     facing = ((camera - samples) * normals).sum(-1) > 0
-    # ‖x − s‖² less ‖x‖², in single precision: which sample is nearest need not be exact
-    square = samples.square().sum(-1).float() - 2 * local.float() @ samples.float().mT
-    nearest = square.masked_fill(~facing[:, None], torch.inf).argmin(-1)
+    nearest = nearest_samples(local, samples, facing)
     return local, local - samples[nearest], normals[nearest], facing
+
+
+@step("samples", Kernels.NUMBA)
+def nearest_samples(local: Tensor, samples: Tensor, facing: Tensor) -> Tensor:
+    """Of the samples that each pose shows the one nearest to each point.
+
+    Args:
+        local: (q, n, 3) points in the part frame of q poses. samples: (s, 3), metres. facing: (q, s) bool.
+    Returns:
+        (q, n) int64; 0 where a pose shows none.
+    """
+    # ‖x − s‖² less ‖x‖², which is the same for all
+    square = samples.square().sum(-1) - 2 * local @ samples.mT
+    return square.masked_fill(~facing[:, None], torch.inf).argmin(-1)
 
 
 def _split(off: Tensor, normal: Tensor, slack: float) -> tuple[Tensor, Tensor, Tensor]:
