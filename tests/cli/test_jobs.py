@@ -30,20 +30,7 @@ ICP = {
     "iterations": 30,
     "min_points": 20,
 }
-SURFACE = {
-    "_target_": "pnet.postprocess.surface_fit.SurfaceFit",
-    "samples": 600,
-    "points": 64,
-    "steps": 8,
-    "reach": 0.004,
-    "slack": 0.002,
-    "free": 1.0,
-    "alike": 0.15,
-    "sizes": [0.0024, 0.0012, 0.0006, 0.0003],
-    "shared": True,
-    "hold": 0.01,
-    "doubtful": 0.001,
-}
+SURFACE = OmegaConf.to_container(OmegaConf.load(Path(__file__).parents[2] / "conf/refine/surface.yaml").refine)
 
 
 pytestmark = pytest.mark.usefixtures("hydra_app")
@@ -199,6 +186,8 @@ def test_the_surface_alone_trains_under_the_plain_name():
     again = resolved(*job.command())
     (evaluation,) = wanted_evaluations(OmegaConf.to_container(again.evaluate))
     assert again.postprocess.refine is None and evaluation.split == "test_g"
+    assert OmegaConf.to_container(recovery_settings(evaluation.postprocess, again))["refine"] == SURFACE
+    again.postprocess.refine = ICP  # of a run that was trained with another refinement nothing stays
     assert OmegaConf.to_container(recovery_settings(evaluation.postprocess, again))["refine"] == SURFACE
 
 

@@ -170,7 +170,14 @@ def recovery_settings(changed: dict[str, Any], trained: DictConfig) -> DictConfi
     changes = OmegaConf.create(changed)
     if "_target_" in changes:
         return changes
-    merged = OmegaConf.create(OmegaConf.to_container(trained.postprocess, resolve=True))
+    settings: Any = OmegaConf.to_container(trained.postprocess, resolve=True)
+    for key, value in changed.items():
+        own = settings.get(key)
+        if isinstance(value, dict) and isinstance(own, dict):
+            kind = own.get("_target_")
+            if value.get("_target_", kind) != kind:
+                settings[key] = None  # another kind takes its place whole
+    merged = OmegaConf.create(settings)
     empty = [key for key, value in _leaves(OmegaConf.to_container(merged)) if value is None]
     known = list(key_paths(OmegaConf.to_container(merged)))
     if merged._target_.endswith(".PoseRecovery"):

@@ -47,7 +47,7 @@ class SurfaceFit:
         free: weight of surface where the camera saw through it.
         alike: turns by quarters about the part's axes are tried too where the surface comes to lie on itself
             to within this share of its radius; 0: none.
-        sizes: steps by which parameters are changed, metres, in turn; none: they stay.
+        sizes: steps by which parameters are changed, metres, in turn, multiples of the last; none: they stay.
         shared: whether the instances of a scene are one part object; false: each has its own size.
         hold: misfit that a change of the sizes must save, a metre of change.
         doubtful: misfit by which the score falls by a factor of e, metres; None: it stays.
@@ -71,22 +71,32 @@ class SurfaceFit:
     def __post_init__(self) -> None:
         for name in ("samples", "points", "steps", "reach", "slack", "doubtful", "ambiguous"):
             value = getattr(self, name)
-            if value is not None and value <= 0:
+            if value is not None and not value > 0:
                 raise ValueError(f"postprocess.refine.{name} is {value}, expected a positive number")
-        if any(step <= 0 for step in self.sizes):
+        for name in ("free", "alike", "hold"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"postprocess.refine.{name} is {getattr(self, name)}, expected 0 or more")
+        steps = list(self.sizes or ())
+        if any(not step > 0 for step in steps) or steps != sorted(steps, reverse=True):
             raise ValueError(
-                f"postprocess.refine.sizes is {list(self.sizes)}, expected positive steps in metres, or []"
+                f"postprocess.refine.sizes is {steps}, expected positive steps in metres, the finest last, "
+                "or []"
             )
 
     def refined(
         self, part: ParametricPart, found: Detections, points: Tensor, scenes: Sequence[int]
     ) -> Detections:
         """See `Refinement`; poses, sizes and scores are new. Instances of negative score stay."""
+        if not len(found.R):
+            return found
         clusters = clusters_of(found.instance)
         cloud = points.detach().cpu().double()
         member, valid = clusters.groups.first(self.points)
-        own = OwnPoints(clusters.of(cloud)[member], valid.double())
-        R, t, sizes, score = (x.clone() for x in (found.R, found.t, found.parameters, found.score))
+        own_points = clusters.of(cloud)[member]
+        valid = valid & own_points.isfinite().all(-1)
+        own = OwnPoints(own_points.nan_to_num(0, 0, 0), valid.double())
+        given = found.R, found.t, found.parameters, found.score
+        R, t, sizes, score = (x.detach().double().clone() for x in given)
         end = torch.tensor([0, *scenes]).cumsum(0).tolist()
         for i, seen in enumerate(cloud):
             these = torch.arange(end[i], end[i + 1])
@@ -94,7 +104,7 @@ class SurfaceFit:
             if not len(these):
                 continue
             free = FreeSpace(seen, self.slack)
-            said = sizes[these][~sizes[these].isnan().any(1)]
+            said = sizes[these][sizes[these].isfinite().all(1)]
             together = self.shared and (bool(self.sizes) or bool((said == said[:1]).all()))
             for some in (these,) if together else these.split(1):
                 fit = _Fit(self, part, own.of(some), free, score[some])
@@ -124,8 +134,9 @@ class _Fit:
         self._set, self._part, self._own, self._free, self._score = settings, part, own, free, score
         trust = score + 1e-6
         self._weight = trust / trust.sum()
-        one = part.is_fixed or not bool(known_parameters(part, 1).isnan().any())
-        self._steps = () if one else tuple(settings.sizes)
+        one = known_parameters(part, 1)[0]
+        self._only: Size | None = None if bool(one.isnan().any()) else tuple(one.tolist())
+        self._steps = () if self._only or part.is_fixed else tuple(settings.sizes)
         self._far = settings.slack
 
     def __call__(self, R: Tensor, t: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -133,7 +144,8 @@ class _Fit:
         size = self._said = self._start(sizes)
         surface = self._surface(size)
         if surface is None:
-            return R, t, sizes, self._score
+            fall = 0.0 if self._set.doubtful is None else self._set.reach / self._set.doubtful
+            return R, t, sizes, self._score * math.exp(-fall)
         turns = similar_turns(self._part, self._set.alike)
         best = self._best_of(turns, surface, R, t)
         self._far = max(self._far, float(best.off.median()))
@@ -150,15 +162,24 @@ class _Fit:
             score = score * torch.exp(-best.off / self._set.doubtful)
         if self._set.ambiguous is not None:
             score = score * self._share(every, best, self._set.ambiguous)
-        return best.R, best.t, torch.tensor(size, dtype=torch.float64).expand(len(R), -1), score
+        known = sizes.isfinite().all(1, keepdim=True)
+        if self._steps or self._only or bool(known.any()):  # else nobody has said or sought a size
+            keep = known & (not self._steps and not self._only)
+            sizes = torch.where(keep, sizes, torch.tensor(size, dtype=torch.float64))
+        return best.R, best.t, sizes, score
 
     def _start(self, sizes: Tensor) -> Size:
         """The median of what was said (d, k), on a lattice, so that scenes share their surfaces."""
-        known = sizes[~sizes.isnan().any(1)]
-        said = known.median(0).values.numpy() if len(known) else self._part.grids["L"].mean(0)
-        exact: Size = tuple(said.tolist())
-        near = _rounded(said, self._steps[-1]) if self._steps else exact
-        return exact if self._surface(near) is None else near
+        if self._only:
+            return self._only
+        known, middle = sizes[sizes.isfinite().all(1)], tuple(self._part.grids["L"].mean(0).tolist())
+        exact: Size = tuple(known.median(0).values.tolist()) if len(known) else middle
+        for said in (exact, middle):
+            near = _rounded(np.array(said), self._steps[-1]) if self._steps else said
+            for size in (near, said):
+                if self._surface(size) is not None:
+                    return size
+        return exact
 
     def _search(self, size: Size, best: _Poses, step: float) -> tuple[Size, _Poses]:
         """One parameter after the other up or down by a step, as long as that explains the cloud better."""

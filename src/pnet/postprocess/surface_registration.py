@@ -67,7 +67,7 @@ class FreeSpace:
         inside = ((place >= 0) & (place < self._size)).all(-1)
         column, row = torch.where(inside[..., None], place, 0).unbind(-1)
         depth = self._depth[row * self._size[0] + column]
-        seen = inside & depth.isfinite()
+        seen = inside & depth.isfinite() & (places[..., 2] > 0)
         return torch.where(seen, depth - places[..., 2] - self._slack, 0.0).clamp(min=0)
 
     def _place(self, direction: Tensor) -> Tensor:
@@ -129,7 +129,7 @@ def misfit(
     _, off, normal, facing = _nearest(surface, own, R, t)
     height, past, _ = _split(off, normal, slack)
     distance = torch.hypot(height, past).clamp(max=most)
-    points = (distance * own.counted).sum(-1) / own.counted.sum(-1)
+    points = (distance * own.counted).sum(-1) / own.counted.sum(-1).clamp(min=1)
     places = torch.from_numpy(surface.points) @ R.mT + t[:, None]
     through = free.through(places).clamp(max=most)
     return points + share * (through * facing).sum(-1) / facing.sum(-1).clamp(min=1)
@@ -183,7 +183,7 @@ def _spacing(direction: Tensor) -> float:
     if not len(direction):
         return 1.0
     some = direction[:: max(len(direction) // 256, 1)]
-    between = torch.cdist(some, direction)
+    between = torch.cdist(some, direction, compute_mode="donot_use_mm_for_euclid_dist")
     own = between.masked_fill(between <= 0, torch.inf).amin(1)
     own = own[own.isfinite()]
     return max(1.25 * float(own.median()), 1e-6) if len(own) else 1.0
