@@ -30,7 +30,8 @@ ICP = {
     "iterations": 30,
     "min_points": 20,
 }
-SURFACE = OmegaConf.to_container(OmegaConf.load(Path(__file__).parents[2] / "conf/refine/surface.yaml").refine)
+CONF = Path(__file__).parents[2] / "conf"
+SURFACE = OmegaConf.to_container(OmegaConf.load(CONF / "refine" / "surface.yaml").refine)
 
 
 pytestmark = pytest.mark.usefixtures("hydra_app")
