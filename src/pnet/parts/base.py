@@ -178,6 +178,12 @@ class ParametricPart(ABC):
     def _mesh_centroid(self, parameters: tuple[float, ...]) -> Points:
         return np.asarray(self._construct(np.array(parameters)).center_mass)
 
+    @property
+    def only_size(self) -> Points | None:
+        """(k,) metres of the one part object that all grids hold; None where there are several."""
+        grid = np.concatenate(list(self.grids.values()))
+        return grid[0] if bool((grid == grid[0]).all()) else None
+
     def part_object(self, grid: str, index: int) -> Points:
         """Parameters of a part object.
 

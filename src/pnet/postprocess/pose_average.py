@@ -91,6 +91,5 @@ class PoseAveraging:
 
 def known_parameters(part: ParametricPart, d: int) -> Tensor:
     """(d, k) metres: the part's own where there is but one part object, in all its grids, else NaN."""
-    grid = torch.from_numpy(np.concatenate(list(part.grids.values())))
-    row = grid[0] if bool((grid == grid[0]).all()) else torch.full_like(grid[0], math.nan)
-    return row.expand(d, -1).clone()
+    size = np.full(part.k, math.nan) if part.only_size is None else part.only_size
+    return torch.from_numpy(size).expand(d, -1).clone()

@@ -19,7 +19,6 @@ from pnet.geometry.rigid import rotation_angle
 from pnet.geometry.symmetry import nearest_equivalent
 from pnet.parts.base import ParametricPart
 from pnet.postprocess.grouping import clusters_of
-from pnet.postprocess.pose_average import known_parameters
 from pnet.postprocess.surface import Surface, sample_surface
 from pnet.postprocess.surface_registration import FreeSpace, OwnPoints, misfit, register
 from pnet.records import Detections
@@ -134,8 +133,8 @@ class _Fit:
         self._set, self._part, self._own, self._free, self._score = settings, part, own, free, score
         trust = score + 1e-6
         self._weight = trust / trust.sum()
-        one = known_parameters(part, 1)[0]
-        self._only: Size | None = None if bool(one.isnan().any()) else tuple(one.tolist())
+        only = part.only_size
+        self._only: Size | None = None if only is None else tuple(only.tolist())
         self._steps = () if self._only or part.is_fixed else tuple(settings.sizes)
         self._far = settings.slack
 
@@ -144,8 +143,7 @@ class _Fit:
         size = self._said = self._start(sizes)
         surface = self._surface(size)
         if surface is None:
-            fall = 0.0 if self._set.doubtful is None else self._set.reach / self._set.doubtful
-            return R, t, sizes, self._score * math.exp(-fall)
+            return R, t, sizes, self._fallen(torch.tensor(self._set.reach, dtype=torch.float64))
         turns = similar_turns(self._part, self._set.alike)
         best = self._best_of(turns, surface, R, t)
         self._far = max(self._far, float(best.off.median()))
@@ -157,16 +155,21 @@ class _Fit:
         size = self._between(size, best)
         every = self._turned(turns, self._known(size), best.R, best.t)
         best = self._least(every)
-        score = self._score
-        if self._set.doubtful is not None:
-            score = score * torch.exp(-best.off / self._set.doubtful)
+        score = self._fallen(best.off)
         if self._set.ambiguous is not None:
             score = score * self._share(every, best, self._set.ambiguous)
-        known = sizes.isfinite().all(1, keepdim=True)
-        if self._steps or self._only or bool(known.any()):  # else nobody has said or sought a size
-            keep = known & (not self._steps and not self._only)
-            sizes = torch.where(keep, sizes, torch.tensor(size, dtype=torch.float64))
+        said = sizes.isfinite().all(1, keepdim=True)
+        found = torch.tensor(size, dtype=torch.float64)
+        if self._steps or self._only:
+            sizes = found.expand_as(sizes)
+        elif bool(said.any()):  # else nobody has said or sought a size
+            sizes = torch.where(said, sizes, found)
         return best.R, best.t, sizes, score
+
+    def _fallen(self, off: Tensor) -> Tensor:
+        """(d,) the score under so much misfit (d,) or ()."""
+        doubtful = self._set.doubtful
+        return self._score if doubtful is None else self._score * torch.exp(-off / doubtful)
 
     def _start(self, sizes: Tensor) -> Size:
         """The median of what was said (d, k), on a lattice, so that scenes share their surfaces."""
@@ -260,11 +263,8 @@ class _Fit:
     ) -> _Poses:
         own, settings = self._own if own is None else own, self._set
         R, t = register(surface, own, R, t, settings.slack, steps)
-        return _Poses(R, t, self._misfit(surface, own, R, t))
-
-    def _misfit(self, surface: Surface, own: OwnPoints, R: Tensor, t: Tensor) -> Tensor:
-        settings = self._set
-        return misfit(surface, own, R, t, settings.slack, self._free, settings.free, settings.reach)
+        off = misfit(surface, own, R, t, settings.slack, self._free, settings.free, settings.reach)
+        return _Poses(R, t, off)
 
     def _surface(self, size: Size) -> Surface | None:
         return sample_surface(self._part, size, self._set.samples)
