@@ -120,6 +120,34 @@ def test_another_camera_is_told_beside_the_trainings_own(smoke, made, run_here, 
     assert "pnet-predict run=x.safetensors" in card and "part=tn34" not in card
 
 
+def test_a_refinement_goes_into_the_file_and_the_figures_are_those_with_it(smoke_copy, run_here, tmp_path):
+    fit = ("refine=surface", "postprocess.refine.sizes=[]", "postprocess.refine.steps=2")
+    given = ("run=outputs/run", f"output={tmp_path}/x.safetensors", "card=true", *fit)
+    folder = smoke_copy.folder
+    assert run_here(folder, "export", *given).code == 0
+    own = read_bundle(tmp_path / "x.safetensors").about["evaluations"]
+    assert set(own) == {"test_l, not refined"}
+    assert run_here(folder, "evaluate", "run=outputs/run", "split=test_l", *fit).code == 0
+    assert run_here(folder, "export", *given).code == 0
+    bundle = read_bundle(tmp_path / "x.safetensors")
+    assert bundle.settings["postprocess"]["refine"]["steps"] == 2
+    assert read_run(smoke_copy.run).postprocess.refine is None
+    scored = [path for path in (smoke_copy.run / "evaluation").iterdir() if path.name != "test_l"]
+    fitted, voted = (
+        json.loads((path / "metrics.json").read_text())
+        for path in (*scored, smoke_copy.run / "evaluation" / "test_l")
+    )
+    about = bundle.about["evaluations"]
+    assert set(about) == {"test_l", "test_l, not refined"}
+    assert fitted["mAP"] == about["test_l"]["mAP"] and voted["mAP"] == about["test_l, not refined"]["mAP"]
+    card = (tmp_path / "x.md").read_text()
+    assert rows(card)["refinement"] == "SurfaceFit" and "|  | test_l | test_l, not refined |" in card
+    again = (f"run={tmp_path}/x.safetensors", f"output={tmp_path}/y.safetensors")
+    assert run_here(folder, "export", *again).code == 0
+    assert (tmp_path / "y.safetensors").read_bytes() == (tmp_path / "x.safetensors").read_bytes()
+    assert "x.safetensors: refine= changes what" in run_here(folder, "export", *again, "refine=none").error
+
+
 def test_without_card_there_is_none(smoke, run_here, tmp_path):
     assert run_here(smoke.folder, "export", "run=outputs/run", f"output={tmp_path}/x.pnet").code == 0
     assert [path.name for path in tmp_path.iterdir()] == ["x.pnet"]
@@ -133,6 +161,7 @@ def test_without_card_there_is_none(smoke, run_here, tmp_path):
         (["output=x.pnet", "card=true", "licence=null"], "licence=None: expected the name of a licence"),
         (["output=x.pnet", "run=nowhere"], "nowhere: no such bundle"),
         (["output=x.pnet", "carte=true"], "carte: unknown key"),
+        (["output=x.pnet", "+postprocess.trust=null"], "postprocess.trust: pnet-export takes refine= alone"),
     ],
 )
 def test_mistakes_are_told_in_one_line(smoke_copy, run_here, words, error):

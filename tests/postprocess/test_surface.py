@@ -1,14 +1,16 @@
-"""Samples of a part's surface: on it, with its normals, and those that look at the camera."""
+"""A part's surface: its triangles, samples of it with its normals, and those that look at the camera."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from scipy.spatial.transform import Rotation
 from tests.postprocess.test_icp import surface_distance
 
-from pnet.postprocess.surface import Surface, sample_surface
+from pnet.postprocess import surface as module
+from pnet.postprocess.surface import SLIVER, Surface, sample_surface
 
 
 def test_only_faces_that_look_at_the_camera_are_matched():
@@ -46,3 +48,51 @@ def test_samples_are_the_same_every_time(part, random_sizes):
 def test_an_impossible_size_has_no_surface(tn06, size):
     """A nut with a hole wider than itself, one of a negative edge, one of a size that is no number."""
     assert sample_surface(tn06, size, 100) is None
+
+
+def test_triangles_are_those_of_the_mesh(part, random_sizes):
+    """All of them here, wound as their outward normals say, and closed."""
+    size = random_sizes(part, 1)[0]
+    mesh = part.mesh(size.numpy())
+    triangles = sample_surface(part, tuple(size.tolist()), 10).triangles
+    np.testing.assert_allclose(triangles.corners, mesh.triangles, rtol=0, atol=1e-15)
+    side, other = (triangles.corners[:, i] - triangles.corners[:, 0] for i in (1, 2))
+    twice = np.cross(side, other)  # the area
+    np.testing.assert_allclose(
+        np.einsum("ij,ij->i", twice, triangles.normals) / 2, mesh.area_faces, rtol=1e-9
+    )
+    volume = np.einsum("ij,ij->", twice, triangles.corners[:, 0]) / 6
+    assert volume == pytest.approx(mesh.volume, rel=1e-9) and volume > 0
+
+
+def flat(corners: list[list[float]], faces: list[list[int]]) -> trimesh.Trimesh:
+    return trimesh.Trimesh(np.array(corners, np.float64), faces, process=False)
+
+
+def test_slivers_are_dropped(tn34, monkeypatch):
+    """Triangles of 50 mm², of half and twice the area that a sliver may have, and of none."""
+    wide = 2 * SLIVER / 0.01  # metres: that high over a side of 10 mm the area is the limit
+    places = [[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, wide / 2, 0], [0, 2 * wide, 0], [0.005, 0, 0]]
+    mesh = flat(places, [[0, 1, 2], [0, 1, 3], [0, 1, 4], [0, 1, 5]])
+    monkeypatch.setattr(type(tn34), "mesh", lambda self, parameters: mesh)
+    triangles = sample_surface(tn34, (0.0161, 0.0171), 10).triangles
+    np.testing.assert_array_equal(triangles.corners[:, 2], np.array(places)[[2, 4]])
+    np.testing.assert_allclose(triangles.normals, [[0, 0, 1]] * 2, rtol=0, atol=1e-12)
+    sample_surface.cache_clear()
+
+
+def test_of_a_mesh_too_fine_the_samples_stand_for_the_surface(tn34, monkeypatch):
+    size = (0.0163, 0.0173)
+    fine = len(tn34.mesh(np.array(size)).faces)
+    exact = []
+    for most in (fine, fine - 1):
+        monkeypatch.setattr(module, "MOST_TRIANGLES", most)
+        sample_surface.cache_clear()
+        exact.append(sample_surface(tn34, size, 100))
+    sample_surface.cache_clear()
+    known, unknown = exact
+    assert len(known.triangles.corners) == fine and unknown.exact is None
+    assert np.array_equal(known.points, unknown.points)
+    corners = unknown.triangles.corners
+    assert corners.shape == (100, 3, 3) and np.array_equal(unknown.triangles.normals, unknown.normals)
+    assert all(np.array_equal(corners[:, i], unknown.points) for i in range(3))

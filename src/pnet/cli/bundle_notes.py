@@ -24,12 +24,17 @@ LEARNT_BY = (
 )
 
 
-def about(run: Path, cfg: DictConfig) -> dict[str, Any]:
-    """Plain values; what nobody knows is left out. cfg: the run's settings."""
+def about(run: Path, cfg: DictConfig, changes: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Plain values; what nobody knows is left out.
+
+    Args:
+        cfg: the run's settings. changes: settings of its post-processing that differ in the bundle.
+    """
     state, manifest = read_json(run / "provenance.json"), read_json(run / MANIFEST)
     metrics = read_json(run / METRICS) if (run / METRICS).is_file() else {}
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
-    scored = {**(metrics.get("evaluations") or {}), **evaluations(run, cfg)}
+    noted = {} if changes else metrics.get("evaluations") or {}
+    scored = {**noted, **evaluations(run, cfg, changes)}
     return {
         **_picked(state, STOOD_ON),
         **_picked(metrics, CAME_OUT),
@@ -39,15 +44,17 @@ def about(run: Path, cfg: DictConfig) -> dict[str, Any]:
     }
 
 
-def evaluations(run: Path, cfg: DictConfig) -> dict[str, Any]:
-    """The metrics of pnet-evaluate by split, of the run's present weights and post-processing."""
-    found = {split: _evaluation(run, cfg, split) for split in SPLITS}
+def evaluations(run: Path, cfg: DictConfig, changes: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The metrics of pnet-evaluate by split, of the run's present weights and the bundle's post-processing;
+    where that is not the run's, of the run's beside."""
+    found = {split: _evaluation(run, cfg, Evaluation(split, changes or {})) for split in SPLITS}
+    if changes:
+        found |= {f"{split}, not refined": _evaluation(run, cfg, Evaluation(split)) for split in SPLITS}
     return {split: metrics for split, metrics in found.items() if metrics is not None}
 
 
-def _evaluation(run: Path, cfg: DictConfig, split: str) -> dict[str, Any] | None:
-    """The metrics of a split; None where there are none, or of what the run was before."""
-    evaluation = Evaluation(split)
+def _evaluation(run: Path, cfg: DictConfig, evaluation: Evaluation) -> dict[str, Any] | None:
+    """Its metrics; None where there are none, or of what the run was before."""
     path = evaluation.folder(run) / PREDICTIONS
     try:
         metrics, (header, _) = read_json(path.with_name(METRICS)), read_predictions(path)
@@ -56,7 +63,7 @@ def _evaluation(run: Path, cfg: DictConfig, split: str) -> dict[str, Any] | None
     scored = metrics.pop("predictions", None) == file_digest(path)
     expected = expected_header(evaluation, run, cfg, header.data)
     current = scored and expected.items() <= vars(header).items()
-    return {"split": split, "data": header.data, **metrics} if current else None
+    return {"split": evaluation.split, "data": header.data, **metrics} if current else None
 
 
 def _picked(content: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:

@@ -90,19 +90,27 @@ class Estimator(DepthEstimator):
         return cls.load(bundle, postprocess=postprocess, background=background, device=device)
 
 
-def bundle_of(path: Path) -> Bundle:
-    """What a run's folder or a bundle's file holds."""
-    return run_bundle(path) if path.is_dir() else read_bundle(path)
+def bundle_of(path: Path, changes: dict[str, Any] | None = None) -> Bundle:
+    """What a run's folder, with changes of its post-processing, or a bundle's file holds."""
+    if path.is_dir():
+        return run_bundle(path, changes)
+    if changes:
+        raise ValueError(
+            f"{path}: refine= changes what the figures on the card are of; export the run's folder"
+        )
+    return read_bundle(path)
 
 
-def run_bundle(run: Path) -> Bundle:
-    """What a bundle of a run's folder holds."""
+def run_bundle(run: Path, changes: dict[str, Any] | None = None) -> Bundle:
+    """What a bundle of a run's folder holds; changes: settings of its post-processing that differ."""
     cfg = read_run(run)
     if not is_trained(cfg):
         raise ValueError(f"{run}: {cfg.method.name} needs no training and has no weights")
     weights = read_weights(run, cfg)
     manifest = read_json(run / MANIFEST)
     settings: Any = OmegaConf.to_container(OmegaConf.masked_copy(cfg, list(NEEDED)), resolve=True)
+    if changes:
+        settings["postprocess"] = OmegaConf.to_container(recovery_settings(changes, cfg), resolve=True)
     targets = OmegaConf.to_container(cfg.data.targets, resolve=True)
     settings["data"] = {"points": cfg.data.points, "targets": targets}
     settings["trainer"] = {key: cfg.trainer[key] for key in ("accelerator", "precision")}
@@ -110,7 +118,7 @@ def run_bundle(run: Path) -> Bundle:
     points = cfg.data.points or seen.points
     if points is None:
         raise ValueError(f"{run / MANIFEST}: does not say how many points the scenes had; set data.points")
-    return Bundle(settings, weights, points, seen.camera, mesh_files(settings), about(run, cfg))
+    return Bundle(settings, weights, points, seen.camera, mesh_files(settings), about(run, cfg, changes))
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,9 @@ import sys
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from pnet.cli.app import run_app
 from pnet.cli.prediction_inputs import camera_words
@@ -34,7 +34,7 @@ def export(cfg: DictConfig) -> None:
     output = Path(cfg.output)
     card = output.with_suffix(".md")
     check_values(cfg, output, card)
-    bundle = bundle_of(Path(cfg.run))
+    bundle = bundle_of(Path(cfg.run), refinement(cfg))
     camera = chosen_camera(cfg)
     if camera is not None:
         bundle = replace(bundle, camera=camera.camera)
@@ -51,6 +51,21 @@ def export(cfg: DictConfig) -> None:
     if cfg.card:
         out.print(f"its card: {card}", markup=False)
     out.print(f"next: pnet-predict run={output} input=FILE", markup=False)
+
+
+def refinement(cfg: DictConfig) -> dict[str, Any]:
+    """What `refine=` changes of the run's post-processing.
+
+    Raises:
+        ValueError: where another setting of it is changed: the card would not tell of it.
+    """
+    from pnet.cli.app import closest
+
+    changes: Any = OmegaConf.to_container(cfg.postprocess, resolve=True)
+    for key in changes:
+        if key != "refine":
+            raise ValueError(f"postprocess.{key}: pnet-export takes refine= alone{closest(key, ['refine'])}")
+    return {str(key): value for key, value in changes.items()}
 
 
 def check_values(cfg: DictConfig, output: Path, card: Path) -> None:

@@ -1,4 +1,4 @@
-"""Samples of a part's surface, onto which clouds are registered."""
+"""A part's surface, onto which clouds are registered: its triangles, and samples of it."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,20 @@ import numpy as np
 
 from pnet.parts.base import ParametricPart, Points
 
+SLIVER = 1e-12  # square metres; what has no area has no normal
+MOST_TRIANGLES = 2000  # of a finer mesh the samples stand for the surface
 GRAZING = math.sin(math.radians(10))  # faces turned away by less may be seen, as the pose is not exact yet
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """Attributes:
+    corners: (f, 3, 3) part frame, metres; three times the same place is that place alone.
+    normals: (f, 3) outward unit vectors.
+    """
+
+    corners: Points
+    normals: Points
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,10 +30,17 @@ class Surface:
 
     Attributes:
         points: (n, 3) part frame, metres. normals: (n, 3) outward unit vectors.
+        exact: what they are samples of; None: nobody knows.
     """
 
     points: Points
     normals: Points
+    exact: Triangles | None = None
+
+    @property
+    def triangles(self) -> Triangles:
+        """The surface itself; where nobody knows it its samples, each a place alone."""
+        return self.exact or Triangles(np.repeat(self.points[:, None], 3, 1), self.normals)
 
     def facing(self, R: Points, t: Points) -> "Surface":
         """Those that the pose R (3, 3), t (3,) part → camera turns to the camera."""
@@ -42,4 +62,7 @@ def sample_surface(part: ParametricPart, parameters: tuple[float, ...], count: i
     except ValueError:
         return None
     points, face = mesh.sample(count, return_index=True, seed=0)
-    return Surface(np.asarray(points, np.float64), np.asarray(mesh.face_normals[face], np.float64))
+    corners, normals = np.asarray(mesh.triangles, np.float64), np.asarray(mesh.face_normals, np.float64)
+    wide = mesh.area_faces > SLIVER
+    exact = Triangles(corners[wide], normals[wide]) if wide.sum() <= MOST_TRIANGLES else None
+    return Surface(np.asarray(points, np.float64), normals[face], exact)

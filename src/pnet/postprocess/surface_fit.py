@@ -3,12 +3,15 @@
 Votes say where keypoints are, not what was seen. Here the surface of the template itself is laid onto each
 instance's points, in the pose that was voted and in those that look much like it; and as all instances of a
 scene are one part object, the size under which all of them together explain the cloud best is theirs.
+
+Parts that look alike from most sides differ by fractions of a millimetre: so distances are from the
+triangles themselves, and every ray counts that a pose stands in the way of.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import permutations, product
 
 import numpy as np
@@ -20,13 +23,15 @@ from pnet.geometry.symmetry import nearest_equivalent
 from pnet.parts.base import ParametricPart
 from pnet.postprocess.grouping import clusters_of
 from pnet.postprocess.surface import Surface, sample_surface
-from pnet.postprocess.surface_registration import FreeSpace, OwnPoints, misfit, register
+from pnet.postprocess.surface_registration import OwnPoints, Sight, misfit, register
 from pnet.records import Detections
 
+COARSE = 0.001  # metres: distances that count in full while a pose may still be far off
 ROUNDS = 3  # each parameter is tried up and down at most so often with one step
 FEW = 2  # steps of a registration for another size
 WIDE = 0.001  # metres: after sizes have changed in steps of this, other poses are tried again
 SAME = 0.1  # radians between rotations that count as one
+WIDER = 1.4  # reach of rays that are looked at, as a share of the part's radius of which it was voted
 OTHER = 0.35  # radians between poses that cannot both be right
 Size = tuple[float, ...]
 
@@ -40,15 +45,18 @@ class SurfaceFit:
     the middle of the part's learning grid.
 
     Attributes:
-        samples: of the part's surface. points: the most points of an instance that count.
-        steps: of a registration. reach: what is farther off the surface counts as so far, metres.
-        slack: distances that noise and the gaps between points leave open, metres.
-        free: weight of surface where the camera saw through it.
+        samples: of the part's surface, where its mesh is too fine. points: the most points of an instance
+            that are laid onto it. steps: of a registration.
+        reach: what is farther off the surface counts as so far, metres.
+        slack: distances along the surface and the rays that noise leaves open, metres.
+        free: weight of a ray that a pose stands in the way of, to a point's.
         alike: turns by quarters about the part's axes are tried too where the surface comes to lie on itself
             to within this share of its radius; 0: none.
         sizes: steps by which parameters are changed, metres, in turn, multiples of the last; none: they stay.
         shared: whether the instances of a scene are one part object; false: each has its own size.
         hold: misfit that a change of the sizes must save, a metre of change.
+        larger: misfit that a larger size must save besides, a metre: an end that nobody sees may be
+            anywhere behind what is seen, and is likely not far.
         doubtful: misfit by which the score falls by a factor of e, metres; None: it stays.
         ambiguous: where another of the turned poses explains an instance nearly as well the score falls too:
             a pose counts less by a factor of e for so much misfit more, metres; None: it does not fall.
@@ -64,6 +72,7 @@ class SurfaceFit:
     sizes: Sequence[float]
     shared: bool
     hold: float
+    larger: float
     doubtful: float | None
     ambiguous: float | None
 
@@ -72,7 +81,7 @@ class SurfaceFit:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"postprocess.refine.{name} is {value}, expected a positive number")
-        for name in ("free", "alike", "hold"):
+        for name in ("free", "alike", "hold", "larger"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"postprocess.refine.{name} is {getattr(self, name)}, expected 0 or more")
         steps = list(self.sizes or ())
@@ -93,7 +102,7 @@ class SurfaceFit:
         member, valid = clusters.groups.first(self.points)
         own_points = clusters.of(cloud)[member]
         valid = valid & own_points.isfinite().all(-1)
-        own = OwnPoints(own_points.nan_to_num(0, 0, 0), valid.double())
+        own_points, counted = own_points.nan_to_num(0, 0, 0), valid.double()
         given = found.R, found.t, found.parameters, found.score
         R, t, sizes, score = (x.detach().double().clone() for x in given)
         end = torch.tensor([0, *scenes]).cumsum(0).tolist()
@@ -102,11 +111,13 @@ class SurfaceFit:
             these = these[score[these] >= 0]
             if not len(these):
                 continue
-            free = FreeSpace(seen, self.slack)
+            sight = Sight(seen)
             said = sizes[these][sizes[these].isfinite().all(1)]
             together = self.shared and (bool(self.sizes) or bool((said == said[:1]).all()))
             for some in (these,) if together else these.split(1):
-                fit = _Fit(self, part, own.of(some), free, score[some])
+                mine = found.instance[i].cpu() == some[:, None]
+                own = OwnPoints(own_points[some], counted[some], own_points[some, :0], mine.sum(1).double())
+                fit = _Fit(self, part, own, score[some], partial(sight.around, t[some], mine))
                 R[some], t[some], sizes[some], score[some] = fit(R[some], t[some], sizes[some])
         return replace(found, R=R, t=t, parameters=sizes, score=score)
 
@@ -125,18 +136,24 @@ class _Fit:
 
     Args:
         own: their d points each. score: (d,) how much each of them counts for the size.
+        rays: the others (d, r, 3) that pass them at most so far away, metres.
     """
 
     def __init__(
-        self, settings: SurfaceFit, part: ParametricPart, own: OwnPoints, free: FreeSpace, score: Tensor
+        self,
+        settings: SurfaceFit,
+        part: ParametricPart,
+        own: OwnPoints,
+        score: Tensor,
+        rays: Callable[[float], Tensor],
     ) -> None:
-        self._set, self._part, self._own, self._free, self._score = settings, part, own, free, score
+        self._set, self._part, self._own, self._score, self._rays = settings, part, own, score, rays
         trust = score + 1e-6
         self._weight = trust / trust.sum()
         only = part.only_size
         self._only: Size | None = None if only is None else tuple(only.tolist())
         self._steps = () if self._only or part.is_fixed else tuple(settings.sizes)
-        self._far = settings.slack
+        self._reach = self._far = max(settings.reach, self._allowed(self._steps[:1]))
 
     def __call__(self, R: Tensor, t: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Poses R (d, 3, 3), t (d, 3), sizes (d, k) and score (d,); as they were where they make no part."""
@@ -144,15 +161,21 @@ class _Fit:
         surface = self._surface(size)
         if surface is None:
             return R, t, sizes, self._fallen(torch.tensor(self._set.reach, dtype=torch.float64))
+        radius = WIDER * float(np.linalg.norm(surface.points, axis=1).max())
+        self._own = replace(self._own, others=self._rays(radius))
         turns = similar_turns(self._part, self._set.alike)
         best = self._best_of(turns, surface, R, t)
-        self._far = max(self._far, float(best.off.median()))
+        usual = float(best.off.median())
         for step in self._steps:
+            self._reach = max(self._set.reach, self._allowed([step]))
+            self._far = max(self._reach, usual)
+            best = self._judged(self._known(size), best.R, best.t)
             size, best = self._search(size, best, step)
             if step >= WIDE:
                 again = self._best_of(turns, self._known(size), best.R, best.t)
                 best = min(best, again, key=lambda poses: self._total(size, poses))
         size = self._between(size, best)
+        self._reach = self._set.reach
         every = self._turned(turns, self._known(size), best.R, best.t)
         best = self._least(every)
         score = self._fallen(best.off)
@@ -165,6 +188,11 @@ class _Fit:
         elif bool(said.any()):  # else nobody has said or sought a size
             sizes = torch.where(said, sizes, found)
         return best.R, best.t, sizes, score
+
+    @staticmethod
+    def _allowed(steps: Sequence[float]) -> float:
+        """Distance up to which it counts how far off a point is: what sizes that are off by a step can do."""
+        return 2 * max(steps, default=0.0)
 
     def _fallen(self, off: Tensor) -> Tensor:
         """(d,) the score under so much misfit (d,) or ()."""
@@ -224,7 +252,8 @@ class _Fit:
         """What all instances together make of a size, metres."""
         change = float(np.abs(np.subtract(size, self._said)).mean())
         # one that is farther off than most were is somewhere else: it says nothing of the size
-        return float((self._weight * poses.off.clamp(max=self._far)).sum()) + self._set.hold * change
+        off = float((self._weight * poses.off.clamp(max=self._far)).sum())
+        return off + self._set.hold * change + self._set.larger * float(np.mean(size))
 
     def _moved(self, size: Size, poses: _Poses) -> _Poses | None:
         """The poses registered again under another size; None where that makes no part."""
@@ -261,10 +290,15 @@ class _Fit:
     def _registered(
         self, surface: Surface, R: Tensor, t: Tensor, steps: int, own: OwnPoints | None = None
     ) -> _Poses:
+        own, slack = self._own if own is None else own, self._set.slack
+        far = steps // 2 if steps > FEW else 0
+        R, t = register(surface, own, R, t, max(slack, COARSE), far)
+        R, t = register(surface, own, R, t, slack, steps - far)
+        return self._judged(surface, R, t, own)
+
+    def _judged(self, surface: Surface, R: Tensor, t: Tensor, own: OwnPoints | None = None) -> _Poses:
         own, settings = self._own if own is None else own, self._set
-        R, t = register(surface, own, R, t, settings.slack, steps)
-        off = misfit(surface, own, R, t, settings.slack, self._free, settings.free, settings.reach)
-        return _Poses(R, t, off)
+        return _Poses(R, t, misfit(surface, own, R, t, settings.slack, settings.free, self._reach))
 
     def _surface(self, size: Size) -> Surface | None:
         return sample_surface(self._part, size, self._set.samples)

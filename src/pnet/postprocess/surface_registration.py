@@ -15,7 +15,6 @@ from pnet.postprocess.kernels import Kernels, step
 from pnet.postprocess.surface import Surface
 
 TURN = 0.3  # radians, the largest of a step
-MOST_CELLS = 2000  # a side of the table of depths
 STIFFNESS = (1e-7, 1e-2)  # share of a step's normal equations that holds turn (metres²) and shift back
 
 
@@ -25,54 +24,47 @@ class OwnPoints:
 
     Attributes:
         points: (d, n, 3) camera frame, metres. counted: (d, n) 1, or 0 where an instance has fewer.
+        others: (d, r, 3) places where rays past the instance end; zeros where there are fewer.
+        number: (d,) of the instance's points, those not counted too.
     """
 
     points: Tensor
     counted: Tensor
+    others: Tensor
+    number: Tensor
 
     def of(self, index: Tensor) -> "OwnPoints":
         """Those of some instances, of any of them several times."""
-        return OwnPoints(self.points[index], self.counted[index])
+        return OwnPoints(self.points[index], self.counted[index], self.others[index], self.number[index])
 
 
-class FreeSpace:
-    """How far the camera saw, in every direction.
+class Sight:
+    """What the camera saw around instances: rays that a wrong pose or size stands in the way of.
 
     Args:
-        cloud: (N, 3) camera frame, metres. slack: of the depth, metres.
+        cloud: (N, 3) a scene, camera frame, metres.
     """
 
-    def __init__(self, cloud: Tensor, slack: float) -> None:
-        cloud = cloud[cloud.isfinite().all(1) & (cloud[:, 2] > 0)]
-        direction = cloud[:, :2] / cloud[:, 2:]
-        self._slack = slack
-        self._low, extent = torch.zeros(2, dtype=cloud.dtype), torch.zeros(2, dtype=cloud.dtype)
-        if len(cloud):
-            self._low = direction.amin(0)
-            extent = direction.amax(0) - self._low
-        # a stray point far outside makes the cells coarse, not the table large
-        self._cell = max(_spacing(direction), float(extent.max()) / MOST_CELLS)
-        place = self._place(direction)
-        columns, rows = ((extent / self._cell).floor().long() + 3).tolist()
-        self._size = torch.tensor([columns, rows])
-        nearest = torch.full((rows * columns,), torch.inf, dtype=cloud.dtype)
-        nearest.scatter_reduce_(0, place[:, 1] * columns + place[:, 0], cloud[:, 2], "amin")
-        # the nearest of all around: what lies beside an edge must not count as seen through
-        around = F.max_pool2d(-nearest.view(1, rows, columns), 3, 1, 1)
-        self._depth = -around.flatten()
+    def __init__(self, cloud: Tensor) -> None:
+        self._cloud = torch.where(cloud.isfinite().all(1, keepdim=True), cloud, 0)
 
-    def through(self, places: Tensor) -> Tensor:
-        """By how much the camera saw past places (..., 3), metres; 0 where it saw nothing."""
-        place = self._place(places[..., :2] / places[..., 2:])
-        inside = ((place >= 0) & (place < self._size)).all(-1)
-        column, row = torch.where(inside[..., None], place, 0).unbind(-1)
-        depth = self._depth[row * self._size[0] + column]
-        seen = inside & depth.isfinite() & (places[..., 2] > 0)
-        return torch.where(seen, depth - places[..., 2] - self._slack, 0.0).clamp(min=0)
+    def around(self, t: Tensor, own: Tensor, radius: float) -> Tensor:
+        """Places where rays past instances end, behind or beside them.
 
-    def _place(self, direction: Tensor) -> Tensor:
-        """Column and row of directions (..., 2); a border of one cell is left free."""
-        return ((direction - self._low) / self._cell).floor().long() + 1
+        Args:
+            t: (d, 3) places, metres. own: (d, N) points to leave out. radius: how near rays pass, metres.
+        Returns:
+            (d, r, 3); zeros where an instance has fewer.
+        """
+        ray = F.normalize(self._cloud, dim=-1)
+        along = t @ ray.mT  # (d, N)
+        across = t.square().sum(-1)[:, None] - along.square()
+        depth = torch.linalg.vector_norm(self._cloud, dim=-1)
+        near = (across < radius**2) & (depth > along - radius) & ~own
+        count = near.sum(1)
+        most = int(count.max()) if len(count) else 0
+        order = near.int().argsort(dim=1, descending=True, stable=True)[:, :most]
+        return torch.where(near.gather(1, order)[..., None], self._cloud[order], 0)
 
 
 def register(
@@ -85,14 +77,16 @@ def register(
 
     Args:
         surface: n samples. own: of q poses. R: (q, 3, 3), t: (q, 3) part → camera, metres.
-        slack: distance along the surface that samples and points leave open, metres; a point twice as far
-            off counts half.
+        slack: distance along the surface that noise leaves open, metres; a point twice as far off counts
+            half.
     Returns:
         R (q, 3, 3), t (q, 3).
     """
+    if not steps:
+        return R, t
     hold = R.new_tensor([STIFFNESS[0]] * 3 + [STIFFNESS[1]] * 3)
     for _ in range(steps):
-        local, off, normal, _ = _nearest(surface, own, R, t)
+        local, off, normal = _nearest(surface, own, R, t)
         weight = own.counted / (1 + off.square().sum(-1) / (2 * slack) ** 2)
         height, past, towards = _split(off, normal, slack)
         A, b = _normal_equations(local, normal, height, weight)
@@ -113,51 +107,120 @@ def misfit(
     R: Tensor,
     t: Tensor,
     slack: float,
-    free: FreeSpace,
     share: float,
     most: float,
 ) -> Tensor:
     """How badly poses explain what was seen.
 
     Args:
-        surface, own, R, t, slack: as for `register`. share: weight of surface in free space.
+        surface, own, R, t, slack: as for `register`.
+        share: weight of rays that the surface stands in the way of.
         most: what lies farther off counts as so far, metres.
     Returns:
         (q,) metres: mean distance of own points from the surface that the pose shows, plus `share` times the
-        mean depth by which the camera saw through that surface.
+        depths by which the camera saw through that surface, over the number of the instance's points.
     """
-    _, off, normal, facing = _nearest(surface, own, R, t)
+    _, off, normal = _nearest(surface, own, R, t)
     height, past, _ = _split(off, normal, slack)
     distance = torch.hypot(height, past).clamp(max=most)
     points = (distance * own.counted).sum(-1) / own.counted.sum(-1).clamp(min=1)
-    places = torch.from_numpy(surface.points) @ R.mT + t[:, None]
-    through = free.through(places).clamp(max=most)
-    return points + share * (through * facing).sum(-1) / facing.sum(-1).clamp(min=1)
+    if share == 0:
+        return points
+    through = seen_through(surface, own.others, R, t, slack).clamp(max=most)
+    return points + share * through.sum(-1) / own.number.clamp(min=1)
 
 
-def _nearest(surface: Surface, own: OwnPoints, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Own points (q, n, 3) in the part frame, their offsets from the nearest sample that the pose shows,
-    the normals there, and which samples it shows (q, s)."""
-    samples, normals = torch.from_numpy(surface.points), torch.from_numpy(surface.normals)
-    local = (own.points - t[:, None]) @ R
-    camera = -(t[:, None] @ R)
-    facing = ((camera - samples) * normals).sum(-1) > 0
-    nearest = nearest_samples(local, samples, facing)
-    return local, local - samples[nearest], normals[nearest], facing
+def seen_through(surface: Surface, others: Tensor, R: Tensor, t: Tensor, slack: float) -> Tensor:
+    """(q, r) by how much rays to places (q, r, 3) would have gone on beyond the surface, metres."""
+    triangles = surface.triangles
+    corners, normals = torch.from_numpy(triangles.corners), torch.from_numpy(triangles.normals)
+    camera = -(t[:, None] @ R)[:, 0]
+    local = (others - t[:, None]) @ R
+    hit = first_hit(local, camera, corners, _facing(corners[:, 0], normals, R, t))
+    length = torch.linalg.vector_norm(others, dim=-1)
+    return torch.where(hit.isfinite(), (1 - hit) * length - slack, 0).clamp(min=0)
 
 
-@step("samples", Kernels.NUMBA)
-def nearest_samples(local: Tensor, samples: Tensor, facing: Tensor) -> Tensor:
-    """Of the samples that each pose shows the one nearest to each point.
+@step("rays", Kernels.NUMBA)
+def first_hit(seen: Tensor, camera: Tensor, corners: Tensor, facing: Tensor) -> Tensor:
+    """Where rays from the camera first meet a triangle that faces it.
 
     Args:
-        local: (q, n, 3) points in the part frame of q poses. samples: (s, 3), metres. facing: (q, s) bool.
+        seen: (q, r, 3) places on the rays, part frame of q poses. camera: (q, 3). corners: (f, 3, 3).
+        facing: (q, f) bool.
     Returns:
-        (q, n) int64; 0 where a pose shows none.
+        (q, r) float64 share of the way from the camera to the place, above 1 behind it; infinite where a ray
+        meets none.
     """
-    # ‖x − s‖² less ‖x‖², which is the same for all
-    square = samples.square().sum(-1) - 2 * local @ samples.mT
-    return square.masked_fill(~facing[:, None], torch.inf).argmin(-1)
+    side, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    found = torch.full(seen.shape[:2], torch.inf, dtype=torch.float64, device=seen.device)
+    for i in range(len(seen)):  # pose by pose, for memory's sake
+        ray, start = (seen[i] - camera[i])[:, None], camera[i] - corners[:, 0]  # (r, 1, 3), (f, 3)
+        across = torch.linalg.cross(ray.expand(-1, len(side), -1), other.expand(len(ray), -1, -1))
+        det = (across * side).sum(-1)
+        u = (across * start).sum(-1) / det
+        turned = torch.linalg.cross(start, side)
+        v = (ray * turned).sum(-1) / det
+        hits = facing[i] & (det > 0) & (u >= 0) & (v >= 0) & (u + v <= 1)
+        share = (turned * other).sum(-1) / det
+        if len(side) and len(ray):
+            found[i] = share.masked_fill(~hits, torch.inf).amin(-1)
+    return found
+
+
+def _nearest(surface: Surface, own: OwnPoints, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Own points (q, n, 3) in the part frame, their offsets from the nearest place of the surface that the
+    pose shows, and the normals there."""
+    triangles = surface.triangles
+    corners, normals = torch.from_numpy(triangles.corners), torch.from_numpy(triangles.normals)
+    local = (own.points - t[:, None]) @ R
+    place, which = nearest_on_triangles(local, corners, normals, _facing(corners[:, 0], normals, R, t))
+    return local, local - place, normals[which]
+
+
+def _facing(places: Tensor, normals: Tensor, R: Tensor, t: Tensor) -> Tensor:
+    """(q, s) which of the places (s, 3) with normals (s, 3) the poses turn to the camera."""
+    camera = -(t[:, None] @ R)
+    return ((camera - places) * normals).sum(-1) > 0
+
+
+@step("triangles", Kernels.NUMBA)
+def nearest_on_triangles(
+    local: Tensor, corners: Tensor, normals: Tensor, facing: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Of the triangles that each pose shows the place nearest to each point.
+
+    Args:
+        local: (q, n, 3) points in the part frame of q poses. corners: (f, 3, 3) metres; a triangle may have
+            no area. normals: (f, 3) unit vectors, any where it has none. facing: (q, f) bool.
+    Returns:
+        Places (q, n, 3) and their triangles (q, n) int64; the first corner of all where a pose shows none.
+    """
+    place = torch.empty_like(local)
+    which = torch.empty(local.shape[:2], dtype=torch.int64, device=local.device)
+    for i, (points, shown) in enumerate(zip(local, facing, strict=True)):  # pose by pose, for memory's sake
+        places = _on_triangles(points, corners, normals)
+        square = (points[:, None] - places).square().sum(-1).masked_fill(~shown, torch.inf)
+        which[i] = square.argmin(-1)
+        place[i] = places[torch.arange(len(points), device=local.device), which[i]]
+        if not bool(shown.any()):
+            place[i] = corners[0, 0]
+    return place, which
+
+
+def _on_triangles(points: Tensor, corners: Tensor, normals: Tensor) -> Tensor:
+    """(n, f, 3) of each triangle the place nearest to points (n, 3)."""
+    start, along = corners, corners.roll(-1, 1) - corners  # the three sides
+    length = along.square().sum(-1).clamp(min=1e-30)
+    share = ((points[:, None, None] - start) * along).sum(-1) / length
+    on_side = start + share.clamp(0, 1)[..., None] * along  # (n, f, 3 sides, 3)
+    nearest = (points[:, None, None] - on_side).square().sum(-1).argmin(-1)
+    on_side = on_side.gather(2, nearest[..., None, None].expand(-1, -1, 1, 3))[:, :, 0]
+    height = ((points[:, None] - corners[:, 0]) * normals).sum(-1, keepdim=True)
+    foot = points[:, None] - height * normals
+    inward = torch.linalg.cross(normals[:, None].expand_as(along), along)
+    inside = (((foot[:, :, None] - start) * inward).sum(-1) > 0).all(-1)
+    return torch.where(inside[..., None], foot, on_side)
 
 
 def _split(off: Tensor, normal: Tensor, slack: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -176,14 +239,3 @@ def _normal_equations(
     J = torch.cat([torch.linalg.cross(local, direction), direction], -1)
     weighted = (J * weight[..., None]).mT
     return weighted @ J, (weighted @ length[..., None])[..., 0]
-
-
-def _spacing(direction: Tensor) -> float:
-    """A little more than the distance of neighbouring directions (N, 2)."""
-    if not len(direction):
-        return 1.0
-    some = direction[:: max(len(direction) // 256, 1)]
-    between = torch.cdist(some, direction, compute_mode="donot_use_mm_for_euclid_dist")
-    own = between.masked_fill(between <= 0, torch.inf).amin(1)
-    own = own[own.isfinite()]
-    return max(1.25 * float(own.median()), 1e-6) if len(own) else 1.0

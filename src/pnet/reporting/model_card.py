@@ -125,6 +125,7 @@ def _network(content: CardContent) -> Rows:
         ("multiply-adds of a scene", _number(network.get("operations"))),
         ("post-processing", class_name(settings["postprocess"])),
         ("votes", class_name(voting)),
+        ("refinement", class_name(settings["postprocess"].get("refine"))),
     )
 
 
