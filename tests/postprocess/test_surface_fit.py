@@ -231,6 +231,9 @@ def test_no_size_grows_beyond_what_is_seen(tn42, bars_from_their_side):
     narrow = given.parameters - torch.tensor([0.0, 0.0, 0.006])
     again = fitted(EXACT, tn42, (cloud, replace(given, parameters=narrow))).parameters[0]
     assert float(again[2] - narrow[0, 2]) <= 0.0003  # the lattice's half step and the parabola's
+    smallest = min(grid[:, 2].min() for grid in tn42.grids.values())
+    least = min(smallest, float(narrow[0, 2])) - 0.0006
+    assert float(again[2]) > least and float(found[2]) > least  # nor does it vanish
 
 
 def test_bodies_of_two_sizes_find_each_its_own(tn34):
@@ -317,6 +320,9 @@ def test_a_change_costs_and_a_larger_size_besides(search):
     assert search._total((0.018, 0.016), near) - same == pytest.approx((0.003 + 0.005) * 0.001)
     assert search._total((0.016, 0.014), near) - same == pytest.approx((0.003 - 0.005) * 0.001)
     assert search._total((0.018, 0.014), near) - same == pytest.approx(0.003 * 0.002)
+    tiny = search._total((0.0001, 0.0001), near)  # nothing is saved below the grids
+    lowest = float(search._smallest.mean())
+    assert tiny == pytest.approx(2e-4 + 0.003 * 0.0159 + 0.005 * lowest) and lowest > 0.003
     assert search._total((0.016, 0.016), far) - same == pytest.approx(0.0024 - 2e-4)  # two of the first steps
 
 

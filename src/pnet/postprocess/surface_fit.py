@@ -56,7 +56,7 @@ class SurfaceFit:
         shared: whether the instances of a scene are one part object; false: each has its own size.
         hold: misfit that a change of the sizes must save, a metre of change.
         larger: misfit that a larger size must save besides, a metre: an end that nobody sees may be
-            anywhere behind what is seen, and is likely not far.
+            anywhere behind what is seen, and is likely not far. Below the grids' smallest nothing is saved.
         doubtful: misfit by which the score falls by a factor of e, metres; None: it stays.
         ambiguous: where another of the turned poses explains an instance nearly as well the score falls too:
             a pose counts less by a factor of e for so much misfit more, metres; None: it does not fall.
@@ -152,6 +152,7 @@ class _Fit:
         self._weight = trust / trust.sum()
         only = part.only_size
         self._only: Size | None = None if only is None else tuple(only.tolist())
+        self._smallest = np.min([grid.min(0) for grid in part.grids.values()], axis=0)
         self._steps = () if self._only or part.is_fixed else tuple(settings.sizes)
         self._reach = self._far = max(settings.reach, self._allowed(self._steps[:1]))
 
@@ -253,7 +254,9 @@ class _Fit:
         change = float(np.abs(np.subtract(size, self._said)).mean())
         # one that is farther off than most were is somewhere else: it says nothing of the size
         off = float((self._weight * poses.off.clamp(max=self._far)).sum())
-        return off + self._set.hold * change + self._set.larger * float(np.mean(size))
+        # what no instance shows would else shrink to nothing
+        extent = float(np.maximum(size, self._smallest).mean())
+        return off + self._set.hold * change + self._set.larger * extent
 
     def _moved(self, size: Size, poses: _Poses) -> _Poses | None:
         """The poses registered again under another size; None where that makes no part."""

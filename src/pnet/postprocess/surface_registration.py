@@ -72,11 +72,11 @@ def register(
 ) -> tuple[Tensor, Tensor]:
     """Gauss–Newton steps towards the least distances of own points from the surface that a pose shows.
 
-    The distance from the tangent plane of the nearest sample counts, and beyond `slack` that along the plane:
+    The distance from the plane of the nearest triangle counts, and beyond `slack` that along the plane:
     it holds points that lie past an edge.
 
     Args:
-        surface: n samples. own: of q poses. R: (q, 3, 3), t: (q, 3) part → camera, metres.
+        surface: the part's. own: of q poses. R: (q, 3, 3), t: (q, 3) part → camera, metres.
         slack: distance along the surface that noise leaves open, metres; a point twice as far off counts
             half.
     Returns:
@@ -224,8 +224,8 @@ def _on_triangles(points: Tensor, corners: Tensor, normals: Tensor) -> Tensor:
 
 
 def _split(off: Tensor, normal: Tensor, slack: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Offsets (..., 3) from a sample: height over its plane, length along it beyond the slack, and the unit
-    vectors of the latter."""
+    """Offsets (..., 3) from the nearest place: height over its plane, length along it beyond the slack, and
+    the unit vectors of the latter."""
     height = (off * normal).sum(-1)
     along = off - height[..., None] * normal
     length = torch.linalg.vector_norm(along, dim=-1)

@@ -7,6 +7,8 @@ from torch import Tensor
 from pnet.ops.cpu.compiled import in_parts, kernel
 from pnet.ops.cpu.tree import Array
 
+SLIM = 1e-12  # squared sine of an angle between two sides below which rounding decides what is inside
+
 
 def nearest_on_triangles(
     local: Tensor, corners: Tensor, normals: Tensor, facing: Tensor
@@ -64,7 +66,7 @@ def _nearest_place(x: float, y: float, z: float, own: Array, found: Array) -> fl
     area = bb * cc - bc * bc
     u, v = cc * pb - bc * pc, bb * pc - bc * pb  # place = a + (u b + v c) / area
     least = np.inf
-    if area > 0 and u >= 0 and v >= 0 and u + v <= area:
+    if area > SLIM * bb * cc and u >= 0 and v >= 0 and u + v <= area:
         u, v = u / area, v / area
         found[0], found[1], found[2] = (
             own[0] + u * bx + v * cx,
