@@ -9,7 +9,7 @@ import numpy as np
 from pnet.parts.base import ParametricPart, Points
 
 SLIVER = 1e-12  # square metres; what has no area has no normal
-MOST_TRIANGLES = 2000  # of a finer mesh the samples stand for the surface
+MOST_TRIANGLES = 2000  # of a finer mesh patches about the samples stand for the surface
 GRAZING = math.sin(math.radians(10))  # faces turned away by less may be seen, as the pose is not exact yet
 
 
@@ -30,7 +30,7 @@ class Surface:
 
     Attributes:
         points: (n, 3) part frame, metres. normals: (n, 3) outward unit vectors.
-        exact: what they are samples of; None: nobody knows.
+        exact: what they are samples of, or patches that cover it; None: nobody knows.
     """
 
     points: Points
@@ -64,5 +64,19 @@ def sample_surface(part: ParametricPart, parameters: tuple[float, ...], count: i
     points, face = mesh.sample(count, return_index=True, seed=0)
     corners, normals = np.asarray(mesh.triangles, np.float64), np.asarray(mesh.face_normals, np.float64)
     wide = mesh.area_faces > SLIVER
-    exact = Triangles(corners[wide], normals[wide]) if wide.sum() <= MOST_TRIANGLES else None
-    return Surface(np.asarray(points, np.float64), normals[face], exact)
+    points = np.asarray(points, np.float64)
+    if wide.sum() <= MOST_TRIANGLES:
+        return Surface(points, normals[face], Triangles(corners[wide], normals[wide]))
+    return Surface(points, normals[face], _patches(points, normals[face], math.sqrt(mesh.area / count)))
+
+
+def _patches(points: Points, normals: Points, radius: float) -> Triangles:
+    """A triangle about each sample in its tangent plane, wound outwards, with corners so far off, metres:
+    together they cover the surface nearly as its own would."""
+    least = np.eye(3)[np.abs(normals).argmin(1)]
+    first = np.cross(normals, least)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(normals, first)
+    angles = 2 * np.pi / 3 * np.arange(3)
+    around = np.cos(angles)[:, None] * first[:, None] + np.sin(angles)[:, None] * second[:, None]
+    return Triangles(points[:, None] + radius * around, normals)
