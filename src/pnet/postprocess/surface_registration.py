@@ -132,11 +132,8 @@ def misfit(
 
 def seen_through(surface: Surface, others: Tensor, R: Tensor, t: Tensor, slack: float) -> Tensor:
     """(q, r) by how much rays to places (q, r, 3) would have gone on beyond the surface, metres."""
-    triangles = surface.triangles
-    corners, normals = torch.from_numpy(triangles.corners), torch.from_numpy(triangles.normals)
-    camera = -(t[:, None] @ R)[:, 0]
-    local = (others - t[:, None]) @ R
-    hit = first_hit(local, camera, corners, _facing(corners[:, 0], normals, R, t))
+    corners, _, facing = _shown(surface, R, t)
+    hit = first_hit((others - t[:, None]) @ R, -(t[:, None] @ R)[:, 0], corners, facing)
     length = torch.linalg.vector_norm(others, dim=-1)
     return torch.where(hit.isfinite(), (1 - hit) * length - slack, 0).clamp(min=0)
 
@@ -171,17 +168,18 @@ def first_hit(seen: Tensor, camera: Tensor, corners: Tensor, facing: Tensor) -> 
 def _nearest(surface: Surface, own: OwnPoints, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Own points (q, n, 3) in the part frame, their offsets from the nearest place of the surface that the
     pose shows, and the normals there."""
-    triangles = surface.triangles
-    corners, normals = torch.from_numpy(triangles.corners), torch.from_numpy(triangles.normals)
+    corners, normals, facing = _shown(surface, R, t)
     local = (own.points - t[:, None]) @ R
-    place, which = nearest_on_triangles(local, corners, normals, _facing(corners[:, 0], normals, R, t))
+    place, which = nearest_on_triangles(local, corners, normals, facing)
     return local, local - place, normals[which]
 
 
-def _facing(places: Tensor, normals: Tensor, R: Tensor, t: Tensor) -> Tensor:
-    """(q, s) which of the places (s, 3) with normals (s, 3) the poses turn to the camera."""
+def _shown(surface: Surface, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Corners (f, 3, 3) and normals (f, 3) of the triangles, and which of them poses show (q, f)."""
+    triangles = surface.triangles
+    corners, normals = torch.from_numpy(triangles.corners), torch.from_numpy(triangles.normals)
     camera = -(t[:, None] @ R)
-    return ((camera - places) * normals).sum(-1) > 0
+    return corners, normals, ((camera - corners[:, 0]) * normals).sum(-1) > 0
 
 
 @step("triangles", Kernels.NUMBA)
